@@ -1,0 +1,37 @@
+# Each target makes the virtual environment .venv, or brings it up to date, by itself.
+PYTHON ?= python3
+# On Linux, PyPI's torch comes with several GB of CUDA. To get the CPU build instead:
+#   make run TORCH_INDEX=https://download.pytorch.org/whl/cpu
+TORCH_INDEX ?=
+OUT ?= runs/quick
+
+BIN := .venv/bin
+STAMP := .venv/installed
+SETTINGS := constraints.txt setup.cfg pyproject.toml wrappers/setup.cfg wrappers/pyproject.toml
+
+.PHONY: run test lint clean
+.DELETE_ON_ERROR:
+
+run: $(STAMP)
+	$(BIN)/regil train --preset quick --env regil/metaworld-button-press-v0 --out $(OUT)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -m "not slow"
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy regil_sb3 wrappers/regil_wrappers
+
+clean:
+	rm -rf .venv build dist *.egg-info wrappers/build wrappers/dist wrappers/*.egg-info
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# torch first and alone: another package's open range would fetch the newest build of it.
+$(STAMP): $(SETTINGS)
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet -c constraints.txt \
+	    $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ./wrappers -e '.[tests]'
+	touch $@

@@ -1,0 +1,23 @@
+"""ReGIL on Stable-Baselines3: TD3 with a decaying behaviour-cloning term, warmed up by a guide.
+
+Names are loaded on first use, because ``import gymnasium`` reaches this package through its
+plugin entry point and must not pay for torch.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from regil_sb3.success_buffer import SuccessBuffer as SuccessBuffer
+    from regil_sb3.td3bc import TD3BC as TD3BC
+
+__version__ = "0.1.0"
+__all__ = ["TD3BC", "SuccessBuffer"]
+
+_HOME = {"TD3BC": "regil_sb3.td3bc", "SuccessBuffer": "regil_sb3.success_buffer"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'regil_sb3' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)

@@ -1,0 +1,83 @@
+"""Environments that ship with regil-sb3, registered when this package is imported.
+
+Gymnasium before 1.0 calls `register_envs` through the entry point `gymnasium.envs` while it is
+itself still being imported; from 1.0 on it reads no entry points, and `import regil_sb3` is what
+registers. Either way nothing here imports a simulator, torch or stable-baselines3.
+"""
+
+__all__ = ["METAWORLD_TASKS", "register_envs"]
+
+METAWORLD_TASKS = (
+    "assembly",
+    "basketball",
+    "bin-picking",
+    "box-close",
+    "button-press",
+    "button-press-topdown",
+    "button-press-topdown-wall",
+    "button-press-wall",
+    "coffee-button",
+    "coffee-pull",
+    "coffee-push",
+    "dial-turn",
+    "disassemble",
+    "door-close",
+    "door-lock",
+    "door-open",
+    "door-unlock",
+    "drawer-close",
+    "drawer-open",
+    "faucet-close",
+    "faucet-open",
+    "hammer",
+    "hand-insert",
+    "handle-press",
+    "handle-press-side",
+    "handle-pull",
+    "handle-pull-side",
+    "lever-pull",
+    "peg-insert-side",
+    "peg-unplug-side",
+    "pick-out-of-hole",
+    "pick-place",
+    "pick-place-wall",
+    "plate-slide",
+    "plate-slide-back",
+    "plate-slide-back-side",
+    "plate-slide-side",
+    "push",
+    "push-back",
+    "push-wall",
+    "reach",
+    "reach-wall",
+    "shelf-place",
+    "soccer",
+    "stick-pull",
+    "stick-push",
+    "sweep",
+    "sweep-into",
+    "window-close",
+    "window-open",
+)
+"""Meta-World's v3 tasks by their own names, without `-v3`."""
+
+
+def register_envs() -> None:
+    """Register `regil/metaworld-<task>-v0` for every task of `METAWORLD_TASKS`.
+
+    The time limit is not Gymnasium's: it sits inside the environment (`max_steps`), where it
+    counts agent steps under the action repeat and truncates.
+    """
+    from gymnasium.envs.registration import register, registry
+
+    for task in METAWORLD_TASKS:
+        env_id = f"regil/metaworld-{task}-v0"
+        if env_id not in registry:  # calling it twice is harmless and warns of nothing
+            register(
+                env_id,
+                entry_point="regil_sb3.envs.metaworld:MetaWorldEnv",
+                kwargs={"task": task},
+            )
+
+
+register_envs()

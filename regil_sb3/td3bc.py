@@ -1,0 +1,647 @@
+"""TD3BC: TD3, warmed up by a guide, with a decaying behaviour-cloning term on a success buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from os import PathLike
+from typing import Any, ClassVar, Literal, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+from regil_wrappers import Demonstration
+from stable_baselines3 import TD3
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFrequencyUnit
+from stable_baselines3.common.utils import polyak_update, safe_mean
+from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
+from stable_baselines3.td3.policies import Actor, MlpPolicy, MultiInputPolicy, TD3Policy
+from torch import nn
+from torch.nn import functional as F  # noqa: N812
+
+from regil_sb3.policies import ImagePolicy
+from regil_sb3.replay_buffer import FrameReplayBuffer
+from regil_sb3.success_buffer import Observations, SuccessBuffer
+
+SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
+
+
+class TD3BC(TD3):
+    """TD3 that starts from one demonstration.
+
+    The guide (``regil_wrappers.RetrievalGuideWrapper``) acts for the first ``warmup_steps``;
+    episodes that succeed fill a success buffer, which holds the demonstration from the start; then
+    the policy acts. Its actor minimises Eq. 4 of ReGIL,
+    ``-Q(o, pi(o)) + lambda(t) * BC(success buffer)``, with
+    ``lambda(t) = bc_coef * max(1 - t / bc_steps, bc_floor)``.
+
+    This is ReGIL's *online* TD3 with a decaying BC term. It is not the offline TD3+BC of Fujimoto
+    and Gu (2021). With ``bc_coef=0, warmup_steps=0, actor_q="q1", normalize_q=False,
+    reward_scale=1.0, exploration_std=0.0`` and TD3's own values for the arguments they share, it is
+    SB3's TD3 to the last bit.
+
+    Paper: ReGIL, https://regil2026.github.io/
+
+    Args:
+        policy: "CnnPolicy" (``ImagePolicy``), "MlpPolicy", "MultiInputPolicy", or a class.
+        env: the environment, wrapped by the guide (for the warm-up) and a reward.
+        demo: the demonstration, or its file. May be None only without a BC term.
+        learning_rate: of actor and critic.
+        buffer_size: transitions in the replay buffer, all environments together.
+        learning_starts: steps before the first update. No random actions are taken for it while
+            the guide acts.
+        batch_size: transitions, and as many steps of the success buffer, in an update.
+        tau: soft update of the target networks.
+        gamma: discount factor.
+        train_freq: environment steps (of all environments at once) between updates.
+        gradient_steps: updates each time; a float is updates per *transition*, all environments
+            counted: 0.5 makes one update for every two transitions.
+        action_noise: SB3's own; replaces ``exploration_std``.
+        replay_buffer_class: None chooses ``FrameReplayBuffer`` for images, else SB3's.
+        replay_buffer_kwargs: for ``replay_buffer_class``.
+        optimize_memory_usage: SB3's own; images never need it.
+        n_steps: length of n-step returns; dict observations need 1.
+        policy_delay: critic updates for one actor update.
+        target_policy_noise: std of the target's smoothing noise.
+        target_noise_clip: its limit.
+        warmup_steps: steps in which the guide acts. An episode begun in warm-up is finished in it.
+        bc_coef: lambda at the start; 0 for no BC term.
+        bc_floor: lambda's floor as a share of ``bc_coef``.
+        bc_steps: steps until lambda would reach 0; None is the whole of ``learn``.
+        bc_loss: "mse" sums squared errors over action dimensions; "nll" is the Gaussian negative
+            log likelihood with ``bc_std``, up to a constant.
+        bc_std: std of that Gaussian, in actions scaled to [-1, 1].
+        bc_pretrain_steps: updates of the actor by the BC term alone when the warm-up ends.
+        success_buffer_size: steps in the success buffer, the demonstration's included.
+        actor_q: "min" of both critics in the actor's loss, or TD3's "q1".
+        normalize_q: divide the actor's Q by the batch's mean absolute Q.
+        q_coef: weight of Q in the actor's loss; 0 is behaviour cloning on the success buffer alone,
+            and no critic gradient reaches the actor's encoder.
+        reward_scale: factor on rewards when they are sampled (the replay buffer keeps them raw);
+            "auto" asks the environment's ``reward_scale``, and is 1 where there is none.
+        exploration_std: std of Gaussian exploration noise on scaled actions, clipped at
+            ``exploration_clip``.
+        exploration_clip: see there.
+        bootstrap_success: do not treat success as an end (Eq. 6 of the paper has no mask).
+        stats_window_size: episodes in the logged means.
+        tensorboard_log: folder, or None.
+        policy_kwargs: for the policy.
+        verbose: 0, 1 or 2.
+        seed: of all random generators.
+        device: "auto", "cpu", "cuda".
+        _init_setup_model: build the networks now.
+
+    Raises:
+        ValueError: an argument, or the demonstration, does not fit; said before anything is
+            allocated.
+        MemoryError: the replay buffer would not fit into memory.
+        FloatingPointError: from ``learn``: a reward, observation or loss is not finite.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": ImagePolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[TD3Policy],
+        env: GymEnv | str,
+        demo: Demonstration | str | PathLike[str] | None = None,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 100_000,
+        learning_starts: int = 500,
+        batch_size: int = 64,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int | float = 0.5,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 3,
+        policy_delay: int = 2,
+        target_policy_noise: float = 0.2,
+        target_noise_clip: float = 0.3,
+        warmup_steps: int = 5_000,
+        bc_coef: float = 2.0,
+        bc_floor: float = 0.1,
+        bc_steps: int | None = None,
+        bc_loss: Literal["mse", "nll"] = "mse",
+        bc_std: float = 0.1,
+        bc_pretrain_steps: int = 1_000,
+        success_buffer_size: int = 5_000,
+        actor_q: Literal["min", "q1"] = "min",
+        normalize_q: bool = True,
+        q_coef: float = 1.0,
+        reward_scale: float | Literal["auto"] = "auto",
+        exploration_std: float = 0.1,
+        exploration_clip: float = 0.3,
+        bootstrap_success: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        for name, value, allowed in (
+            ("bc_loss", bc_loss, ("mse", "nll")),
+            ("actor_q", actor_q, ("min", "q1")),
+        ):
+            if value not in allowed:
+                raise ValueError(f"{name} is {value!r}: use one of {', '.join(allowed)}")
+        self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
+        self.warmup_steps = warmup_steps
+        self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps
+        self.bc_loss, self.bc_std, self.bc_pretrain_steps = bc_loss, bc_std, bc_pretrain_steps
+        self.success_buffer_size = success_buffer_size
+        self.actor_q, self.normalize_q, self.q_coef = actor_q, normalize_q, q_coef
+        self.reward_scale = reward_scale
+        self.exploration_std, self.exploration_clip = exploration_std, exploration_clip
+        self.bootstrap_success = bootstrap_success
+        self.used_reward_scale = 1.0  # what "auto" turned out to be
+        self.pretrained = False  # whether the BC updates at the end of warm-up are done
+        self._updates_due = 0.0
+        if _init_setup_model:
+            self._check_demo()
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,  # type: ignore[arg-type]
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_delay=policy_delay,
+            target_policy_noise=target_policy_noise,
+            target_noise_clip=target_noise_clip,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=_init_setup_model,
+        )
+
+    def _setup_model(self) -> None:
+        space = self.observation_space
+        stacking = unwrap_vec_wrapper(self.env, VecFrameStack) if self.env is not None else None
+        self.n_stack = stacking.n_stack if isinstance(stacking, VecFrameStack) else 1
+        if isinstance(space, spaces.Dict) and self.n_steps > 1:
+            raise ValueError(
+                f"n_steps={self.n_steps} with dict observations is not supported by SB3's replay "
+                "buffer: set n_steps=1"
+            )
+        chosen = self.replay_buffer_class
+        if chosen is None and is_image_space(space):
+            # TD3's set-up would warn that n_steps is ignored for a class of one's own
+            self.replay_buffer = FrameReplayBuffer(  # type: ignore[assignment]
+                self.buffer_size,
+                space,
+                self.action_space,
+                self.device,
+                self.n_envs,
+                n_stack=self.n_stack,
+                n_steps=self.n_steps,
+                gamma=self.gamma,
+            )
+        self.success_buffer = SuccessBuffer(self.success_buffer_size, self._success_stack())
+        if self.demo is not None and self.demo.actions is not None:
+            self._add_demonstration(self.demo)
+        super()._setup_model()
+        self.replay_buffer_class = chosen
+        self._guided = np.zeros(self.n_envs, bool)
+        self._forget_open_episodes()
+
+    def _success_stack(self) -> int:
+        return self.n_stack if is_image_space(self.observation_space) else 1
+
+    def _check_demo(self) -> None:
+        if self.bc_coef == 0:
+            return
+        if self.demo is None:
+            raise ValueError(f"bc_coef={self.bc_coef} needs demo=: give its file, or set bc_coef=0")
+        if self.demo.actions is None:
+            raise ValueError("the demonstration has no actions, which the BC term needs: set bc_coef=0")
+
+    def _add_demonstration(self, demo: Demonstration) -> None:
+        """Put the demonstration into the success buffer as the policy would have seen it."""
+        assert demo.actions is not None and isinstance(self.action_space, spaces.Box)
+        n = len(demo.actions)
+        if demo.actions.shape[1:] != self.action_space.shape:
+            raise ValueError(
+                f"the demonstration has actions of shape {demo.actions.shape[1:]} but the "
+                f"environment takes {self.action_space.shape}"
+            )
+        low, high = self.action_space.low, self.action_space.high
+        scaled = 2.0 * (np.clip(demo.actions, low, high) - low) / (high - low) - 1.0
+        space = self.observation_space
+        observations: Observations
+        if is_image_space(space) and demo.observations is None:
+            assert space.shape is not None
+            frames = demo.frames[:n].transpose(0, 3, 1, 2)
+            if (frames.shape[1] * self.n_stack, *frames.shape[2:]) != space.shape:
+                height, width = space.shape[1:]
+                raise ValueError(
+                    f"the demonstration has {frames.shape[2]}x{frames.shape[3]} frames with "
+                    f"{frames.shape[1]} channels but the policy sees {height}x{width} with "
+                    f"{space.shape[0]} channels ({self.n_stack} stacked): "
+                    "record it again in this environment"
+                )
+            observations = stack_frames(frames, self.n_stack)
+        elif demo.observations is None:
+            raise ValueError(
+                "the policy does not see the frame, so the BC term needs the demonstration's "
+                "observations=: record it again in this environment, or set bc_coef=0 and demo=None"
+            )
+        elif isinstance(demo.observations, dict):
+            observations = {key: value[:n] for key, value in demo.observations.items()}
+        else:
+            observations = demo.observations[:n]
+        self._check_observations(observations)
+        self.success_buffer.add(observations, scaled.astype(np.float32), pinned=True)
+
+    def _check_observations(self, observations: Observations) -> None:
+        space = self.observation_space
+        got: Any = {k: v.shape[1:] for k, v in observations.items()} if isinstance(
+            observations, dict
+        ) else observations.shape[1:]
+        want: Any = {k: s.shape for k, s in space.items()} if isinstance(
+            space, spaces.Dict
+        ) else space.shape
+        if got != want:
+            raise ValueError(
+                f"the demonstration's observations have shape {got} but the policy sees {want}"
+            )
+
+    # -- collecting ------------------------------------------------------------------------------
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "TD3BC",
+        progress_bar: bool = False,
+    ) -> Any:
+        assert self.env is not None, "You must set the environment before calling learn()"
+        self._check_demo()
+        if self.bc_coef > 0 and not self.success_buffer.steps:
+            assert self.demo is not None
+            self._add_demonstration(self.demo)
+        if self.warmup_steps > 0 and not self.env.has_attr("guide_action"):
+            raise ValueError(
+                f"warmup_steps={self.warmup_steps} needs a guide: wrap the environment in "
+                "regil_wrappers.RetrievalGuideWrapper, or set warmup_steps=0"
+            )
+        if self.reward_scale == "auto":
+            known = self.env.has_attr("reward_scale")
+            self.used_reward_scale = float(self.env.get_attr("reward_scale")[0]) if known else 1.0
+        else:
+            self.used_reward_scale = float(self.reward_scale)
+        result = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        if reset_num_timesteps:
+            self.pretrained = False
+        self._guided = np.full(self.n_envs, self.num_timesteps < self.warmup_steps)
+        self._forget_open_episodes()
+        self._returns: dict[str, list[float]] = {"env_reward": [], "retrieval_reward": []}
+        return result
+
+    def _forget_open_episodes(self) -> None:
+        self._succeeded = np.zeros(self.n_envs, bool)
+        self._episodes: list[list[tuple[Any, npt.NDArray[Any]]]] = [[] for _ in range(self.n_envs)]
+        self._running = {k: np.zeros(self.n_envs) for k in ("env_reward", "retrieval_reward")}
+
+    @property
+    def guided(self) -> bool:
+        """Whether the guide still acts in some environment."""
+        return bool(self._guided.any())
+
+    def _sample_action(
+        self,
+        learning_starts: int,
+        action_noise: ActionNoise | None = None,
+        n_envs: int = 1,
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        assert isinstance(self.action_space, spaces.Box) and self.env is not None
+        if self._guided.all():
+            action = np.zeros((n_envs, *self.action_space.shape), np.float32)
+            buffer_action = action.copy()
+        else:
+            action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
+            if self.exploration_std > 0 and action_noise is None:
+                noise = np.random.normal(0, self.exploration_std, buffer_action.shape)
+                noise = noise.clip(-self.exploration_clip, self.exploration_clip)
+                buffer_action = (buffer_action + noise).clip(-1, 1).astype(np.float32)
+                action = self.policy.unscale_action(buffer_action)
+        if self._guided.any():
+            indices = np.flatnonzero(self._guided)
+            suggested = np.stack(self.env.env_method("guide_action", indices=indices.tolist()))
+            suggested = suggested.clip(self.action_space.low, self.action_space.high)
+            action[indices] = suggested
+            buffer_action[indices] = self.policy.scale_action(suggested)
+        return action, buffer_action
+
+    def _update_info_buffer(
+        self, infos: list[dict[str, Any]], dones: npt.NDArray[Any] | None = None
+    ) -> None:
+        # SB3 reads is_success at the episode's end alone: a success on the way counts too
+        for i, info in enumerate(infos):
+            self._succeeded[i] |= bool(info.get("is_success", False))
+            if dones is not None and dones[i] and "is_success" in info:
+                info["is_success"] = bool(self._succeeded[i])
+        super()._update_info_buffer(infos, dones)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: npt.NDArray[Any],
+        new_obs: Any,
+        reward: npt.NDArray[Any],
+        dones: npt.NDArray[Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        self._check_finite(reward, new_obs)
+        before = self._last_obs
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        for i, info in enumerate(infos):
+            if self._guided[i]:
+                seen = (
+                    {k: v[i].copy() for k, v in before.items()}
+                    if isinstance(before, dict)
+                    else np.array(before[i])  # type: ignore[index]
+                )
+                self._episodes[i].append((seen, buffer_action[i].copy()))
+            retrieval = info.get("retrieval", {})
+            self._running["env_reward"][i] += retrieval.get("env_reward", reward[i])
+            self._running["retrieval_reward"][i] += reward[i]
+            if dones[i]:
+                self._end_episode(i)
+
+    def _end_episode(self, env: int) -> None:
+        if self._guided[env] and self._succeeded[env]:
+            seen, actions = zip(*self._episodes[env], strict=True)
+            observations: Observations = (
+                {k: np.stack([o[k] for o in seen]) for k in seen[0]}
+                if isinstance(seen[0], dict)
+                else np.stack(seen)
+            )
+            self.success_buffer.add(observations, np.stack(actions))
+        for name, running in self._running.items():
+            self._returns[name].append(float(running[env]))
+            del self._returns[name][: -self._stats_window_size]
+            running[env] = 0.0
+        self._episodes[env] = []
+        self._succeeded[env] = False
+        self._guided[env] = self.num_timesteps < self.warmup_steps
+
+    def _check_finite(self, reward: npt.NDArray[Any], new_obs: Any) -> None:
+        values = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}
+        for name, value in {**values, "reward": reward}.items():
+            bad = ~np.isfinite(value).reshape(self.n_envs, -1).all(axis=1)
+            if bad.any():
+                raise FloatingPointError(
+                    f"{name} of environment {int(bad.argmax())} is not finite at step "
+                    f"{self.num_timesteps}: training stopped, the model saved last is untouched"
+                )
+
+    def dump_logs(self) -> None:
+        """Write log data, under fixed names wherever SB3's Monitor sits."""
+        for name, values in self._returns.items():
+            if values:
+                self.logger.record(f"rollout/{name}", safe_mean(values))
+        self.logger.record("success_buffer/steps", self.success_buffer.steps)
+        self.logger.record("success_buffer/episodes", self.success_buffer.episodes)
+        self.logger.record("time/guided", int(self.guided))
+        self.logger.record("train/reward_scale", self.used_reward_scale)
+        super().dump_logs()
+
+    # -- learning --------------------------------------------------------------------------------
+
+    def bc_coef_now(self) -> float:
+        """lambda(t) at the present step."""
+        steps = self.bc_steps if self.bc_steps is not None else max(self._total_timesteps, 1)
+        return self.bc_coef * max(1.0 - self.num_timesteps / steps, self.bc_floor)
+
+    def _bc_term(self) -> th.Tensor:
+        """Behaviour-cloning loss of a batch of the success buffer, a scalar."""
+        seen, actions = self.success_buffer.sample(self.batch_size)
+        observations = (
+            {k: th.as_tensor(v, device=self.device) for k, v in seen.items()}
+            if isinstance(seen, dict)
+            else self._augmented(th.as_tensor(seen, device=self.device))
+        )
+        predicted = self.actor(observations)
+        error = F.mse_loss(predicted, th.as_tensor(actions, device=self.device), reduction="none")
+        loss = error.sum(dim=1).mean()
+        return loss if self.bc_loss == "mse" else loss / (2.0 * self.bc_std**2)
+
+    def _augmented(self, observations: Any) -> Any:
+        return self.policy.augment(observations) if isinstance(self.policy, ImagePolicy) else observations
+
+    def pretrain_bc(self, steps: int, progress: Callable[[int], None] | None = None) -> None:
+        """Train the actor by the BC term alone, then set its target to it.
+
+        Args:
+            steps: updates.
+            progress: called with the number of updates done after each.
+        """
+        self.policy.set_training_mode(True)
+        for done in range(1, steps + 1):
+            loss = self._bc_term()
+            self._require_finite("BC loss", loss.item())
+            self.actor.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.actor.optimizer.step()
+            if progress is not None:
+                progress(done)
+        self.actor_target.load_state_dict(self.actor.state_dict())
+        if steps:
+            self.logger.record("train/bc_loss", loss.item())
+
+    def _require_finite(self, name: str, value: float) -> None:
+        if not np.isfinite(value):
+            raise FloatingPointError(
+                f"{name} is {value} at step {self.num_timesteps}, update {self._n_updates}: training "
+                "stopped, the model saved last is untouched; a lower learning_rate or reward_scale "
+                f"(now {self.used_reward_scale:g}) may help"
+            )
+
+    def _number_of_updates(self, gradient_steps: int | float) -> int:
+        """Turn updates per transition (a float) into whole updates, keeping the remainder."""
+        if not isinstance(gradient_steps, float):
+            return gradient_steps
+        assert not isinstance(self.train_freq, int)
+        if self.train_freq.unit != TrainFrequencyUnit.STEP:  # type: ignore[union-attr]
+            raise ValueError("a fractional gradient_steps needs a train_freq counted in steps")
+        self._updates_due += gradient_steps * self.train_freq.frequency * self.n_envs  # type: ignore[union-attr]
+        whole = int(self._updates_due)
+        self._updates_due -= whole
+        return whole
+
+    def train(self, gradient_steps: int | float, batch_size: int = 64) -> None:
+        """Update critic and actor; a diff of ``TD3.train`` with Eq. 4 as the actor's loss."""
+        if not self.pretrained and not self.guided and self.num_timesteps >= self.warmup_steps:
+            if self.bc_coef > 0:
+                self.pretrain_bc(self.bc_pretrain_steps)
+            self.pretrained = True
+
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+        shared = self.critic.features_extractor is self.actor.features_extractor
+
+        actor_losses, critic_losses, bc_losses = [], [], []
+        for _ in range(self._number_of_updates(gradient_steps)):
+            self._n_updates += 1
+            assert self.replay_buffer is not None
+            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+            observations = self._augmented(replay_data.observations)
+            next_observations = self._augmented(replay_data.next_observations)
+            dones = th.zeros_like(replay_data.dones) if self.bootstrap_success else replay_data.dones
+
+            with th.no_grad():
+                # Target: smoothed target action, min of the target critics
+                noise = replay_data.actions.clone().data.normal_(0, self.target_policy_noise)
+                noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+                next_features = encode(self.critic_target, next_observations)
+                next_actions = self.actor_target.mu(
+                    next_features if shared else encode(self.actor_target, next_observations)
+                )
+                next_actions = (next_actions + noise).clamp(-1, 1)
+                next_q_values, _ = th.min(
+                    q_values(self.critic_target, next_features, next_actions), dim=1, keepdim=True
+                )
+                rewards = replay_data.rewards * self.used_reward_scale
+                target_q_values = rewards + (1 - dones) * discounts * next_q_values
+
+            # Critic
+            features = encode(self.critic, observations)
+            if shared and self.q_coef == 0:
+                features = features.detach()
+            current_q_values = q_values(self.critic, features, replay_data.actions)
+            critic_loss = sum(
+                F.mse_loss(q, target_q_values) for q in current_q_values.split(1, dim=1)
+            )
+            assert isinstance(critic_loss, th.Tensor)
+            critic_losses.append(critic_loss.item())
+            self._require_finite("critic loss", critic_losses[-1])
+            self.critic.optimizer.zero_grad()
+            critic_loss.backward()  # type: ignore[no-untyped-call]
+            self.critic.optimizer.step()
+
+            # Delayed actor, Eq. 4
+            if self._n_updates % self.policy_delay == 0:
+                actor_loss = th.zeros((), device=self.device)
+                if self.q_coef > 0:
+                    # A shared encoder is trained by critic and BC term: here its features are fixed
+                    with th.no_grad():
+                        features = (
+                            features.detach() if shared else encode(self.critic, observations)
+                        )
+                    actions = self.actor.mu(
+                        features if shared else encode(self.actor, observations)
+                    )
+                    q = self._actor_q(features, actions)
+                    scale = q.abs().mean().detach().clamp(min=1e-8) if self.normalize_q else 1.0
+                    actor_loss = -self.q_coef * q.mean() / scale
+                if self.bc_coef > 0:
+                    bc_term = self._bc_term()
+                    bc_losses.append(bc_term.item())
+                    actor_loss = actor_loss + self.bc_coef_now() * bc_term
+                actor_losses.append(actor_loss.item())
+                self._require_finite("actor loss", actor_losses[-1])
+                self.actor.optimizer.zero_grad()
+                actor_loss.backward()  # type: ignore[no-untyped-call]
+                self.actor.optimizer.step()
+
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                # A shared target encoder has moved with the critic's
+                own = self.actor.mu if shared else self.actor
+                own_target = self.actor_target.mu if shared else self.actor_target
+                polyak_update(own.parameters(), own_target.parameters(), self.tau)
+                polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
+                polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/bc_coef", self.bc_coef_now())
+        if actor_losses:
+            self.logger.record("train/actor_loss", np.mean(actor_losses))
+        if bc_losses:
+            self.logger.record("train/bc_loss", np.mean(bc_losses))
+        if critic_losses:
+            self.logger.record("train/critic_loss", np.mean(critic_losses))
+            self.logger.record("train/q", current_q_values.mean().item())
+
+    def _actor_q(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        if self.actor_q == "q1":
+            return self.critic.q_networks[0](th.cat([features, actions], dim=1))
+        return q_values(self.critic, features, actions).min(dim=1, keepdim=True).values
+
+    def learn(
+        self: SelfTD3BC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "TD3BC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfTD3BC:
+        """Learn for ``total_timesteps`` transitions, all environments and the warm-up counted."""
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _excluded_save_params(self) -> list[str]:
+        return [
+            *super()._excluded_save_params(),
+            "demo",
+            "success_buffer",
+            "_episodes",
+            "_guided",
+            "_succeeded",
+            "_running",
+            "_returns",
+        ]
+
+
+def stack_frames(frames: npt.NDArray[Any], n_stack: int) -> npt.NDArray[Any]:
+    """Stack (T, C, H, W) frames as ``VecFrameStack`` does: (T, n_stack * C, H, W), newest last."""
+    padded = np.concatenate([np.zeros((n_stack - 1, *frames.shape[1:]), frames.dtype), frames])
+    return np.concatenate([padded[i : i + len(frames)] for i in range(n_stack)], axis=1)
+
+
+def encode(network: Any, observations: Any) -> th.Tensor:
+    """Features (B, F) of an actor or a critic of SB3's."""
+    features: th.Tensor = network.extract_features(observations, network.features_extractor)
+    return features
+
+
+def q_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """Q of every critic, (B, n_critics)."""
+    inputs = th.cat([features, actions], dim=1)
+    return th.cat([q(inputs) for q in critic.q_networks], dim=1)

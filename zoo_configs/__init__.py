@@ -1,0 +1,1 @@
+"""Hyperparameters, one YAML file per algorithm. A package only so that installs carry the files."""
