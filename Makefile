@@ -32,6 +32,6 @@ clean:
 $(STAMP): $(SETTINGS)
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet -c constraints.txt \
-	    $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
+	    $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ./wrappers -e '.[tests]'
 	touch $@

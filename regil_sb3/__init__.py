@@ -1,11 +1,13 @@
 """ReGIL on Stable-Baselines3: TD3 with a decaying behaviour-cloning term, warmed up by a guide.
 
-Names are loaded on first use, because ``import gymnasium`` reaches this package through its
-plugin entry point and must not pay for torch.
+Importing this package registers its environments (Gymnasium 1.x reads no plugin entry points).
+TD3BC and SuccessBuffer are loaded on first use, so that environments alone do not pay for torch.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+import regil_sb3.envs  # noqa: F401  registers regil/...
 
 if TYPE_CHECKING:
     from regil_sb3.success_buffer import SuccessBuffer as SuccessBuffer

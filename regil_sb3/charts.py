@@ -119,9 +119,9 @@ def line_chart(
                 parts.append(
                     f'<line class="axis" x1="{_LEFT}" x2="{right_edge}" y1="{y:.1f}" y2="{y:.1f}"/>'
                 )
-            x, anchor = (right_edge + 6, "start") if right else (_LEFT - 6, "end")
+            edge, anchor = (right_edge + 6, "start") if right else (_LEFT - 6, "end")
             parts.append(
-                f'<text x="{x}" y="{y + 4.5:.1f}" text-anchor="{anchor}">'
+                f'<text x="{edge}" y="{y + 4.5:.1f}" text-anchor="{anchor}">'
                 f"{_format(tick, as_rate)}</text>"
             )
         for line in here:

@@ -56,14 +56,12 @@ def film_player(
     demo: Demonstration | None, episode: Demonstration | None, alignment: AlignedEpisode | None
 ) -> str:
     """The demonstration beside the evaluation episode: canvases, controls and their data."""
-    given = [
-        ("film-demo", "demonstration", demo),
-        ("film-episode", "evaluation episode", episode),
-    ]
+    named = (("film-demo", "demonstration", demo), ("film-episode", "evaluation episode", episode))
+    given = [(name, label, film) for name, label, film in named if film is not None]
+    if not given:
+        return ""
     clips, figures = [], []
     for name, label, film in given:
-        if film is None:
-            continue
         height, width = film.frames.shape[1:3]
         sprite, columns = _sprite(film.frames)
         clips.append(
@@ -84,9 +82,7 @@ def film_player(
             f'<figure><canvas id="{name}" width="{width}" height="{height}"></canvas>'
             f"<figcaption>{caption}</figcaption></figure>"
         )
-    if not clips:
-        return ""
-    rates = [film.metadata.get("control_rate") for *_, film in given if film is not None]
+    rates = [film.metadata.get("control_rate") for _, _, film in given]
     rate = next((rate for rate in rates if isinstance(rate, int | float) and rate > 0), 20)
     data = {"clips": clips, "rate": rate, "ends": alignment.ends if alignment else []}
     # "<" cannot end the script element this way, whatever a file holds.

@@ -34,11 +34,14 @@ def random_shift(images: th.Tensor, pad: int) -> th.Tensor:
     """
     if pad == 0:
         return images
-    n, _, height, width = images.shape
-    device = images.device
-    rows = th.arange(-pad, height + pad, device=device).clamp_(0, height - 1)
-    cols = th.arange(-pad, width + pad, device=device).clamp_(0, width - 1)
-    padded = images.index_select(2, rows).index_select(3, cols)
+    n, channels, height, width = images.shape
+    inner = slice(pad, -pad)
+    padded = images.new_empty(n, channels, height + 2 * pad, width + 2 * pad)
+    padded[..., inner, inner] = images
+    padded[..., :pad, inner] = images[..., :1, :]
+    padded[..., -pad:, inner] = images[..., -1:, :]
+    padded[..., :pad] = padded[..., pad : pad + 1]
+    padded[..., -pad:] = padded[..., -pad - 1 : -pad]
     corners = th.randint(0, 2 * pad + 1, (n, 2)).tolist()
     # Slices copy whole rows: on a CPU five times faster than one gather over an unfolded view.
     return th.stack(

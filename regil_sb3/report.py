@@ -32,7 +32,7 @@ METHODS = {
     "policy": "Policy",
     "guide": "Guided replay",
     "corrected_guide": "Corrected guide",
-    "bc": "BC on the demonstration",
+    "bc": "BC alone",
 }
 _EXPECTED = ("policy", "guide", "bc")
 _MARKS = ("config.yaml", "progress.csv", "evaluation.json")
@@ -67,10 +67,8 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
         raise ValueError(f"out '{out}' is a folder: give the name of an HTML file")
 
     missing: list[str] = []
-    config = _mapping(_read(run / "config.yaml", _yaml, missing), "config.yaml", missing)
-    evaluation = _mapping(
-        _read(run / "evaluation.json", _json, missing), "evaluation.json", missing
-    )
+    config: dict[str, Any] = _read(run / "config.yaml", _yaml, missing) or {}
+    evaluation: dict[str, Any] = _read(run / "evaluation.json", _json, missing) or {}
     rows: Rows = _read(run / "progress.csv", _progress, missing) or []
     demo: Demonstration | None = _read(run / "demo.hdf5", Demonstration.load, missing)
     episode: Demonstration | None = _read(run / "episode.hdf5", Demonstration.load, missing)
@@ -81,8 +79,7 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
             alignment = _align(demo, episode, config)
         except (ImportError, OSError, ValueError) as error:  # an encoder that is not installed here
             missing.append(f"alignment: {error}")
-    results = {name: _mapping(evaluation.get(name, {}), name, missing) for name in METHODS}
-    results = {name: result for name, result in results.items() if _successes(result)}
+    results = {name: evaluation[name] for name in METHODS if _successes(evaluation.get(name))}
     if evaluation:
         absent = [METHODS[name] for name in _EXPECTED if name not in results]
         if absent:
@@ -90,22 +87,25 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
     if not rows:
         missing.append("no training progress has been logged")
 
-    body = [
+    left = [
         _card("Success over steps", _success_chart(rows, results, evaluation)),
-        _card("Reward over steps", _reward_chart(rows)),
-        _card("Success buffer", _buffer_chart(rows)),
-        _card("Episodes", _strips(results, evaluation)),
-        _card("Demonstration and evaluation episode", film_player(demo, episode, alignment)),
-        _card("Alignment", alignment_picture(demo, episode, alignment)),
-        _card("Configuration", _table(config), wide=True),
+        _card("Reward over steps", _reward_chart(rows), "later"),
+        _card("Success buffer", _buffer_chart(rows), "later"),
     ]
+    right = [
+        _card("Demonstration and evaluation episode", film_player(demo, episode, alignment)),
+        _card("Episodes", _strips(results, evaluation)),
+        _card("Alignment", alignment_picture(demo, episode, alignment)),
+    ]
+    columns = "".join(f'<div class="column">{"".join(cards)}</div>' for cards in (left, right))
     env = config.get("env") or (demo.metadata.get("env_id") if demo else None) or run.resolve().name
     page = Template(files("regil_sb3").joinpath("report.html").read_text("utf-8")).substitute(
         title=html.escape(f"ReGIL: {env}"),
         headline=_headline(results, evaluation),
         missing=_missing_list(missing),
-        body='<div class="grid">' + "".join(body) + "</div>",
-        footer="Success rates are given with their 95 % Wilson interval. A step is one agent "
+        body=f'<div class="grid">{columns}</div>' + _card("Configuration", _table(config), "wide"),
+        footer="In brackets: the 95 % Wilson interval. BC alone: behaviour cloning of the "
+        "demonstration. A step is one agent "
         "transition. TD3BC here is online TD3 with a decaying BC term on a success buffer, not "
         "the offline TD3+BC.",
     )
@@ -131,20 +131,18 @@ def _read(path: Path, reader: Callable[[Path], Any], missing: list[str]) -> Any:
         return None
 
 
-def _mapping(value: Any, name: str, missing: list[str]) -> dict[str, Any]:
-    if isinstance(value, dict):
-        return {str(key): item for key, item in value.items()}
-    if value is not None:
-        missing.append(f"{name} holds a {type(value).__name__} where a mapping was expected")
-    return {}
+def _mapping(value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"it holds a {type(value).__name__} where a mapping was expected")
+    return {str(key): item for key, item in value.items()}
 
 
-def _yaml(path: Path) -> Any:
-    return yaml.safe_load(path.read_text("utf-8"))
+def _yaml(path: Path) -> dict[str, Any]:
+    return _mapping(yaml.safe_load(path.read_text("utf-8")))
 
 
-def _json(path: Path) -> Any:
-    return json.loads(path.read_text("utf-8"))
+def _json(path: Path) -> dict[str, Any]:
+    return _mapping(json.loads(path.read_text("utf-8")))
 
 
 def _progress(path: Path) -> Rows:
@@ -165,8 +163,10 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _successes(result: dict[str, Any]) -> list[bool]:
+def _successes(result: Any) -> list[bool]:
     """Per-episode outcomes; for files that hold only a rate, as many as make that rate."""
+    if not isinstance(result, dict):
+        return []
     if isinstance(result.get("successes"), list):
         return [bool(success) for success in result["successes"]]
     rate, episodes = _number(result.get("success")), _number(result.get("episodes"))
@@ -200,10 +200,8 @@ def _align(demo: Demonstration, episode: Demonstration, config: dict[str, Any]) 
 # Drawing: values in, markup out. Everything read from a file passes `html.escape`.
 
 
-def _card(title: str, content: str, wide: bool = False) -> str:
-    if not content:
-        return ""
-    return f'<section class="card{" wide" * wide}"><h2>{title}</h2>{content}</section>'
+def _card(title: str, content: str, kind: str = "") -> str:
+    return f'<section class="card {kind}"><h2>{title}</h2>{content}</section>' if content else ""
 
 
 def _missing_list(missing: Sequence[str]) -> str:
@@ -233,13 +231,14 @@ def _headline(results: dict[str, dict[str, Any]], evaluation: dict[str, Any]) ->
         cards.append(
             f'<div class="card score" style="--c:var(--{name})"><span>{METHODS[name]}</span>'
             f"<b>{100 * sum(outcomes) / len(outcomes):.0f} %</b>"
-            f'<span class="soft small">{sum(outcomes)} of {len(outcomes)} unseen episodes '
+            f'<span class="soft small">{sum(outcomes)} of {len(outcomes)}<br>'
             f"({low:.0f} to {high:.0f} %)</span></div>"
         )
     steps, frames = _number(evaluation.get("steps")), _number(evaluation.get("frames"))
     after = "" if steps is None else f" after {steps:,.0f} steps"
     after += "" if frames is None else f" ({frames:,.0f} frames)"
-    return f'<p class="soft">Success{after}</p><div class="scores">{"".join(cards)}</div>'
+    scores = f'<div class="scores">{"".join(cards)}</div>'
+    return f'<p class="soft">Success in unseen episodes{after}</p>{scores}'
 
 
 def _column(rows: Rows, name: str) -> list[Point]:

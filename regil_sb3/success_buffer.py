@@ -146,3 +146,9 @@ class SuccessBuffer:
             )
             self._episodes.append(_Episode(observations, state[f"{i}/actions"]))
         self._ends = np.cumsum([len(e) for e in (*self._pinned, *self._episodes)])
+
+
+def stack_frames(frames: npt.NDArray[Any], n_stack: int) -> npt.NDArray[Any]:
+    """Stack (T, C, H, W) frames as ``VecFrameStack`` does: (T, n_stack * C, H, W), newest last."""
+    padded = np.concatenate([np.zeros((n_stack - 1, *frames.shape[1:]), frames.dtype), frames])
+    return np.concatenate([padded[i : i + len(frames)] for i in range(n_stack)], axis=1)

@@ -25,7 +25,7 @@ from torch.nn import functional as F  # noqa: N812
 
 from regil_sb3.policies import ImagePolicy
 from regil_sb3.replay_buffer import FrameReplayBuffer
-from regil_sb3.success_buffer import Observations, SuccessBuffer
+from regil_sb3.success_buffer import Observations, SuccessBuffer, stack_frames
 
 SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
 
@@ -158,6 +158,8 @@ class TD3BC(TD3):
         ):
             if value not in allowed:
                 raise ValueError(f"{name} is {value!r}: use one of {', '.join(allowed)}")
+        if q_coef == 0 and bc_coef == 0:
+            raise ValueError("q_coef=0 and bc_coef=0 leave the actor nothing to learn from")
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
         self.warmup_steps = warmup_steps
         self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps
@@ -203,7 +205,7 @@ class TD3BC(TD3):
     def _setup_model(self) -> None:
         space = self.observation_space
         stacking = unwrap_vec_wrapper(self.env, VecFrameStack) if self.env is not None else None
-        self.n_stack = stacking.n_stack if isinstance(stacking, VecFrameStack) else 1
+        self.n_stack = stacking.stacked_obs.n_stack if isinstance(stacking, VecFrameStack) else 1
         if isinstance(space, spaces.Dict) and self.n_steps > 1:
             raise ValueError(
                 f"n_steps={self.n_steps} with dict observations is not supported by SB3's replay "
@@ -528,9 +530,10 @@ class TD3BC(TD3):
                     next_features if shared else encode(self.actor_target, next_observations)
                 )
                 next_actions = (next_actions + noise).clamp(-1, 1)
-                next_q_values, _ = th.min(
-                    q_values(self.critic_target, next_features, next_actions), dim=1, keepdim=True
+                next_q_values = th.cat(
+                    q_values(self.critic_target, next_features, next_actions), dim=1
                 )
+                next_q_values, _ = th.min(next_q_values, dim=1, keepdim=True)
                 rewards = replay_data.rewards * self.used_reward_scale
                 target_q_values = rewards + (1 - dones) * discounts * next_q_values
 
@@ -539,9 +542,7 @@ class TD3BC(TD3):
             if shared and self.q_coef == 0:
                 features = features.detach()
             current_q_values = q_values(self.critic, features, replay_data.actions)
-            critic_loss = sum(
-                F.mse_loss(q, target_q_values) for q in current_q_values.split(1, dim=1)
-            )
+            critic_loss = sum(F.mse_loss(q, target_q_values) for q in current_q_values)
             assert isinstance(critic_loss, th.Tensor)
             critic_losses.append(critic_loss.item())
             self._require_finite("critic loss", critic_losses[-1])
@@ -590,12 +591,13 @@ class TD3BC(TD3):
             self.logger.record("train/bc_loss", np.mean(bc_losses))
         if critic_losses:
             self.logger.record("train/critic_loss", np.mean(critic_losses))
-            self.logger.record("train/q", current_q_values.mean().item())
+            self.logger.record("train/q", current_q_values[0].mean().item())
 
     def _actor_q(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         if self.actor_q == "q1":
-            return self.critic.q_networks[0](th.cat([features, actions], dim=1))
-        return q_values(self.critic, features, actions).min(dim=1, keepdim=True).values
+            q: th.Tensor = self.critic.q_networks[0](th.cat([features, actions], dim=1))
+            return q
+        return th.cat(q_values(self.critic, features, actions), dim=1).min(dim=1).values
 
     def learn(
         self: SelfTD3BC,
@@ -629,19 +631,13 @@ class TD3BC(TD3):
         ]
 
 
-def stack_frames(frames: npt.NDArray[Any], n_stack: int) -> npt.NDArray[Any]:
-    """Stack (T, C, H, W) frames as ``VecFrameStack`` does: (T, n_stack * C, H, W), newest last."""
-    padded = np.concatenate([np.zeros((n_stack - 1, *frames.shape[1:]), frames.dtype), frames])
-    return np.concatenate([padded[i : i + len(frames)] for i in range(n_stack)], axis=1)
-
-
 def encode(network: Any, observations: Any) -> th.Tensor:
     """Features (B, F) of an actor or a critic of SB3's."""
     features: th.Tensor = network.extract_features(observations, network.features_extractor)
     return features
 
 
-def q_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """Q of every critic, (B, n_critics)."""
+def q_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+    """Q of every critic, (B, 1) each."""
     inputs = th.cat([features, actions], dim=1)
-    return th.cat([q(inputs) for q in critic.q_networks], dim=1)
+    return tuple(q(inputs) for q in critic.q_networks)

@@ -1,8 +1,7 @@
-"""Environments that ship with regil-sb3, registered when this package is imported.
+"""Environments that ship with regil-sb3, registered by `import regil_sb3`.
 
-Gymnasium before 1.0 calls `register_envs` through the entry point `gymnasium.envs` while it is
-itself still being imported; from 1.0 on it reads no entry points, and `import regil_sb3` is what
-registers. Either way nothing here imports a simulator, torch or stable-baselines3.
+Gymnasium from 1.0 on reads no entry points: whoever wants the ids imports the package. Nothing here
+imports a simulator, torch or stable-baselines3.
 """
 
 __all__ = ["METAWORLD_TASKS", "register_envs"]

@@ -1,4 +1,4 @@
-"""A dense reward and a guide from one demonstration, as Gymnasium wrappers (the retrieval of ReGIL)."""
+"""A dense reward and a guide from one demonstration, as Gymnasium wrappers."""
 
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.encoders import Encoder, encoder_names, make_encoder, register_encoder
@@ -9,9 +9,9 @@ __all__ = [
     "Alignment",
     "Demonstration",
     "Encoder",
-    "Retriever",
     "RetrievalGuideWrapper",
     "RetrievalRewardWrapper",
+    "Retriever",
     "encoder_names",
     "make_encoder",
     "register_encoder",

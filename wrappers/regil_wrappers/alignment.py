@@ -1,4 +1,4 @@
-"""Subsequence dynamic time warping and nearest neighbours, on plain arrays (arXiv paper of ReGIL, Eq. 1-2).
+"""Subsequence dynamic time warping and nearest neighbours, on plain arrays (ReGIL, Eq. 1-2).
 
 * ``squared_distances`` - squared Euclidean distance of one embedding to many
 * ``nearest`` - the k nearest frames, ties to the later one
@@ -6,8 +6,8 @@
 * ``best_end`` - the minimum of its last row, Eq. 2
 * ``warping_path`` - the path that ends there
 
-Indices are 0-based: row ``i`` and column ``j`` here are ``i + 1`` and ``j + 1`` in the paper, whose row 0
-(all zeros: a match may start anywhere) and column 0 (infinite) are not stored.
+Indices are 0-based: row ``i`` and column ``j`` here are ``i + 1`` and ``j + 1`` in the paper, whose
+row 0 (all zeros: a match may start anywhere) and column 0 (infinite) are not stored.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def squared_distances(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray
         y: (N, D) float32, the others.
 
     Returns:
-        (N,) float64, not negative.
+        (N,) float64, not negative; summed in float32, so right to about 1e-6 of their value.
 
     Raises:
         ValueError: if the shapes do not fit.
@@ -62,7 +62,7 @@ def squared_distances(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray
     rows = max(1, _BLOCK_BYTES // max(1, 4 * y.shape[1]))
     for first in range(0, len(y), rows):
         difference = y[first : first + rows] - x
-        np.einsum("nd,nd->n", difference, difference, out=distances[first : first + rows])
+        distances[first : first + rows] = np.einsum("nd,nd->n", difference, difference)
     return distances
 
 
@@ -91,15 +91,16 @@ def accumulated_costs(
 ) -> NDArray[np.float64]:
     """The table D of Eq. 1: D(i, j) = c(i, j) + min{D(i-1, j-1), D(i-1, j), D(i, j-1)}.
 
-    Within a row, D(j) = min over s <= j of m(s) + c(s) + ... + c(j), m(s) = min{D(i-1, s-1), D(i-1, s)}: a
-    cumulative sum and a running minimum. To keep the recursion's ties, every sum must be exact: costs are
-    first rounded to a power-of-two grid, at most 2**-51 of (n + m) times the largest cost, fine enough
-    that no sum of float64 rounds. 0 stays 0, and whole numbers stay as they are.
+    Within a row, D(j) is the least of m(s) + c(s) + ... + c(j) over s <= j, where m(s) is
+    min{D(i-1, s-1), D(i-1, s)}: a cumulative sum and a running minimum. To keep the recursion's
+    ties every sum must be exact, so costs are first rounded to a power of two below 2**-50 (n + m)
+    times the largest cost: float64 then holds every sum. 0 stays 0, whole numbers stay the same.
 
     Args:
-        costs: (n, m) float64, c(i, j) >= 0 and finite: n recent frames against m demonstration frames.
-        step_pattern: "symmetric" as in Eq. 1, or "strap": min{D(i-1, j-1), D(i-2, j-1), D(i-1, j-2)},
-            whose paths begin in the first row too and need at least n // 2 + 1 columns.
+        costs: (n, m) float64, c(i, j) >= 0 and finite: n recent frames against m demonstration
+            frames.
+        step_pattern: "symmetric" as in Eq. 1, or "strap" with D(i-2, j-1) and D(i-1, j-2) in place
+            of D(i-1, j) and D(i, j-1); its paths need at least n // 2 + 1 columns.
 
     Returns:
         (n, m) float64; infinite where no path of "strap" ends.
@@ -166,7 +167,8 @@ def warping_path(
 ) -> list[tuple[int, int]]:
     """The cheapest path that ends in the last row at column `end`.
 
-    Where predecessors cost the same the first of `STEP_PATTERNS` is taken: the diagonal before all others.
+    Where predecessors cost the same the first of `STEP_PATTERNS` is taken: the diagonal before all
+    others.
 
     Args:
         table: (n, m) float64 from `accumulated_costs`, with the same step pattern.

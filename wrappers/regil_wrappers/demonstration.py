@@ -1,26 +1,30 @@
 """One demonstration: what was seen and what was done. In memory and as one HDF5 file.
 
-The file has the layout of `robomimic <https://robomimic.github.io>`_, with one episode. N frames, T actions
-(N = T + 1, or N = T), or no actions (T = N then):
+The file has the layout of `robomimic <https://robomimic.github.io>`_, with one episode. N frames
+and T actions (N = T + 1, or N = T), or no actions (T = N then):
 
-======================================  ==================  =========================================
-name                                    shape, dtype        meaning
-======================================  ==================  =========================================
-``data`` attribute ``total``            int                 T
-``data`` attribute ``env_args``         JSON text           ``env_name`` (the Gymnasium id), ``type``
-                                                            (2: robomimic's number for Gym), ``env_kwargs``
-``data`` attribute ``regil_metadata``   JSON text           `Demonstration.metadata`; has ``format_version``
-``data/demo_0`` attr. ``num_samples``   int                 T
-``data/demo_0`` attr. ``observations``  JSON text           how the policy's observations are stored: null
-                                                            (none), a name (array) or a list of names (dict)
-``data/demo_0/actions``                 (T, A) float32      executed actions, in the environment's own units
-``data/demo_0/successes``               (N,) uint8          1 where the task was solved in that frame
-``data/demo_0/obs/agentview_image``     (T, H, W, 3) uint8  frames 0..T-1, RGB, upright
-``data/demo_0/obs/encoder_image``       (T, h, w, 3) uint8  the same moments, larger, for encoders
-``data/demo_0/obs/<name>``              (T, ...)            observations for a policy without a camera
-``data/demo_0/final_obs/<name>``        as in ``obs``,      the frame after the last action, for each name
-                                        without T           in ``obs``; only where N = T + 1
-======================================  ==================  =========================================
+=====================================  ==================  =========================================
+name                                   shape, dtype        meaning
+=====================================  ==================  =========================================
+``data`` attribute ``total``           int                 T
+``data`` attribute ``env_args``        JSON text           ``env_name`` (Gymnasium id), ``type`` (2:
+                                                           robomimic's number for Gym),
+                                                           ``env_kwargs``
+``data`` attribute                     JSON text           `Demonstration.metadata`, with
+``regil_metadata``                                         ``format_version``
+``data/demo_0`` attr. ``num_samples``  int                 T
+``data/demo_0`` attr.                  JSON text           names in ``obs`` that belong to
+``observations``                                           `Demonstration.observations`: null
+(none),
+                                                           a name (array) or a list of names (dict)
+``data/demo_0/actions``                (T, A) float32      executed actions, in the environment's
+units ``data/demo_0/successes``              (N,) uint8          1 where the task is solved in that
+frame ``data/demo_0/obs/agentview_image``    (T, H, W, 3) uint8  frames 0..T-1, RGB, upright
+``data/demo_0/obs/encoder_image``      (T, h, w, 3) uint8  the same moments, larger, for encoders
+``data/demo_0/obs/<name>``             (T, ...)            observations of a policy without a camera
+``data/demo_0/final_obs/<name>``       as in ``obs``       the frame after the last action, for each
+                                       without T           name in ``obs``; only where N = T + 1
+=====================================  ==================  =========================================
 
 Everything but the images is optional; arrays are gzip-compressed.
 """
@@ -34,9 +38,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-import h5py
+import h5py  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,7 +52,8 @@ _FRAMES = "agentview_image"
 _ENCODER_FRAMES = "encoder_image"
 _OBSERVATION = "observation"
 
-# What a file may claim before memory is allocated for it. Deflate cannot shrink by more than about 1032.
+# What a file may claim before memory is allocated for it. Deflate cannot shrink by more than about
+# 1032.
 _MAX_BYTES = 4 * 1024**3
 _MAX_COMPRESSION = 1100
 _MAX_TEXT = 1_000_000
@@ -81,19 +86,20 @@ class Demonstration:
         (11, [84, 84])
 
     Attributes:
-        frames: (T + 1, H, W, 3) uint8, RGB, upright: the frame before each action, and the last outcome.
-            T frames are taken too; a guide repeats the last action at the end then.
+        frames: (T + 1, H, W, 3) uint8, RGB, upright: the frame before each action, and the last
+            outcome. T frames are taken too; a guide repeats the last action at the end then.
         actions: (T, A) float32, as executed (clipped), in the environment's own units; or None.
-        observations: array or dict of arrays with as many rows as frames: what a policy that does not see
-            the frame needs; or None.
+        observations: array or dict of arrays with as many rows as frames: what a policy that does
+            not see the frame needs; or None.
         encoder_frames: (as many as frames, h, w, 3) uint8: the same moments as larger pictures, for
             encoders; or None.
-        successes: (as many as frames,) bool, whether the task is solved in each; False in the first; or None.
-        metadata: JSON values. Filled in where missing: ``env_id`` (str), ``camera`` (str), ``render``
-            (dict of render settings), ``image_size`` ([H, W], pixels), ``action_repeat`` (int),
-            ``control_rate`` (Hz, of actions), ``action_low`` and ``action_high`` (lists of A numbers),
-            ``seed``, ``seeds_tried`` (int), ``versions`` (dict of packages), ``format_version`` (int).
-            Unknown ones are None, or empty.
+        successes: (as many as frames,) bool, whether the task is solved in each; False in the
+            first; or None.
+        metadata: JSON values. Filled in where missing: ``env_id`` (str), ``camera`` (str),
+            ``render`` (dict of render settings), ``image_size`` ([H, W], pixels), ``action_repeat``
+            (int), ``control_rate`` (Hz, of actions), ``action_low`` and ``action_high`` (lists of A
+            numbers), ``seed``, ``seeds_tried`` (int), ``versions`` (dict of packages),
+            ``format_version`` (int). Unknown ones are None, or empty.
 
     Raises:
         ValueError: if a shape, type or length does not fit, or a value is NaN or out of range.
@@ -121,7 +127,8 @@ class Demonstration:
             for key in self.observations:
                 if not isinstance(key, str) or not key or "/" in key or key in _RESERVED:
                     raise ValueError(
-                        f"observations have a key {key!r}: use text without '/', and none of {_RESERVED}"
+                        f"observations have a key {key!r}: use text without '/', and none of "
+                        f"{_RESERVED}"
                     )
             checked = {k: _rows(f"observations[{k!r}]", v, n) for k, v in self.observations.items()}
             put("observations", checked)
@@ -130,12 +137,15 @@ class Demonstration:
         if self.encoder_frames is not None:
             put("encoder_frames", _pictures("encoder_frames", self.encoder_frames))
             if len(self.encoder_frames) != n:
-                raise ValueError(f"there are {len(self.encoder_frames)} encoder_frames but {n} frames")
+                raise ValueError(
+                    f"there are {len(self.encoder_frames)} encoder_frames but {n} frames"
+                )
         if self.successes is not None:
             successes = np.asarray(self.successes)
             if successes.dtype != np.bool_ or successes.shape != (n,):
                 raise ValueError(
-                    f"successes are {successes.dtype} {successes.shape}: one bool for each of {n} frames"
+                    f"successes are {successes.dtype} {successes.shape}: "
+                    f"they must be bool, one for each of {n} frames"
                 )
             if successes[0]:
                 raise ValueError("successes[0] is True: the task is solved before it begins")
@@ -148,8 +158,8 @@ class Demonstration:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one HDF5 file (layout: see this module).
 
-        It is written under a temporary name beside `path` and renamed: an interrupted save leaves whatever
-        was there.
+        It is written under a temporary name beside `path` and renamed: an interrupted save leaves
+        whatever was there.
 
         Args:
             path: the file; an existing one is replaced, missing folders are made.
@@ -199,7 +209,9 @@ class Demonstration:
         if self.actions is not None:
             demo.create_dataset("actions", data=self.actions, compression="gzip")
         if self.successes is not None:
-            demo.create_dataset("successes", data=self.successes.astype(np.uint8), compression="gzip")
+            demo.create_dataset(
+                "successes", data=self.successes.astype(np.uint8), compression="gzip"
+            )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Demonstration:
@@ -210,12 +222,14 @@ class Demonstration:
 
         Raises:
             FileNotFoundError: if there is none.
-            ValueError: if it is no HDF5 file, cut short, not one of ours, or its content is not valid.
+            ValueError: if it is no HDF5 file, cut short, not one of ours, or its content is not
+                valid.
         """
         path = Path(path)
         if not path.exists():
             raise FileNotFoundError(
-                f"there is no demonstration {str(path)!r}: record one with 'regil record ENV -o {path}'"
+                f"there is no demonstration {str(path)!r}: "
+                f"record one with 'regil record ENV -o {path}'"
             )
         if path.is_dir():
             raise ValueError(f"demo {str(path)!r} is a folder: name the HDF5 file in it")
@@ -244,7 +258,9 @@ def _pictures(name: str, value: Any) -> NDArray[np.uint8]:
 def _rows(name: str, value: Any, n: int) -> NDArray[Any]:
     array = np.ascontiguousarray(value)
     if array.dtype.kind not in "biuf" or array.ndim == 0 or len(array) != n or array.size == 0:
-        raise ValueError(f"{name} are {array.dtype} {array.shape}: numbers, one row for each of {n} frames")
+        raise ValueError(
+            f"{name} are {array.dtype} {array.shape}: numbers, one row for each of {n} frames"
+        )
     if not np.isfinite(array).all():
         row = int(np.argwhere(~np.isfinite(array))[0][0])
         raise ValueError(f"{name} have NaN or infinity in row {row}")
@@ -257,7 +273,9 @@ def _actions(value: Any, n: int, metadata: dict[str, Any]) -> NDArray[np.float32
         raise ValueError(f"actions are {array.dtype} {array.shape}: they must be float32 (T, A)")
     array = np.ascontiguousarray(array, dtype=np.float32)
     if len(array) not in (n - 1, n) or len(array) == 0:
-        raise ValueError(f"there are {len(array)} actions for {n} frames: there must be {n - 1} (or {n})")
+        raise ValueError(
+            f"there are {len(array)} actions for {n} frames: there must be {n - 1} (or {n})"
+        )
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):
         raise ValueError(f"actions[{bad[0][0]}] has NaN or infinity in dimension {bad[0][1]}")
@@ -281,7 +299,9 @@ def _metadata(given: Any, size: list[int]) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise ValueError(f"metadata is {type(given).__name__}: it must be a dict")
     try:
-        metadata: dict[str, Any] = json.loads(json.dumps(_METADATA_DEFAULTS | given, allow_nan=False))
+        metadata: dict[str, Any] = json.loads(
+            json.dumps(_METADATA_DEFAULTS | given, allow_nan=False)
+        )
     except (TypeError, ValueError) as error:
         raise ValueError(f"metadata must hold JSON values only: {error}") from error
     if metadata["image_size"] is None:
@@ -346,7 +366,9 @@ def _opened(path: Path) -> Iterator[h5py.File]:
 def _read(file: h5py.File, file_bytes: int) -> dict[str, Any]:
     data = _member(file, "data", h5py.Group)
     if "regil_metadata" not in data.attrs:
-        raise ValueError("this HDF5 file is not a ReGIL demonstration (no attribute 'regil_metadata')")
+        raise ValueError(
+            "this HDF5 file is not a ReGIL demonstration (no attribute 'regil_metadata')"
+        )
     metadata = _json(data, "regil_metadata")
     demo = _member(data, "demo_0", h5py.Group)
     obs = _member(demo, "obs", h5py.Group)
@@ -408,7 +430,7 @@ def _array(group: h5py.Group, name: Any, file_bytes: int) -> NDArray[Any]:
     if claimed > _MAX_BYTES or claimed > _MAX_COMPRESSION * file_bytes:
         raise ValueError(f"{dataset.name!r} claims {claimed} bytes, more than this file can hold")
     try:
-        return cast("NDArray[Any]", np.asarray(dataset[()]))
+        return np.asarray(dataset[()])
     except OSError as error:
         raise ValueError(f"{dataset.name!r} cannot be read, the file is damaged") from error
 

@@ -1,4 +1,4 @@
-"""Encoders: pictures in, embeddings out. The only module that may import torch, and only when asked to.
+"""Encoders: pictures in, embeddings out. The only module that may import torch, and lazily.
 
 * ``Encoder`` - the protocol
 * ``register_encoder``, ``make_encoder``, ``encoder_names`` - encoders by name
@@ -15,6 +15,7 @@ import zipfile
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -38,11 +39,13 @@ class Encoder(Protocol):
 
     An encoder may also have these attributes:
 
-    * ``frame_size`` (int or None): the side of the square picture it would like to be given. Environments
-      that can render one are asked for it; otherwise it gets the observation's picture.
-    * ``cache_key`` (str or None): everything that its output depends on (name, settings, digest of the
-      weights). Without it embeddings are not cached.
-    * ``slow`` (bool): whether embeddings of a demonstration are worth a file in the user's cache folder.
+    * ``frame_size`` (int or None): the side of the square picture it would like to be given.
+      Environments that can render one are asked for it; otherwise it gets the observation's
+      picture.
+    * ``cache_key`` (str or None): everything that its output depends on (name, settings, digest of
+      the weights). Without it embeddings are not cached.
+    * ``slow`` (bool): whether embeddings of a demonstration are worth a file in the user's cache
+      folder.
     """
 
     def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -60,7 +63,8 @@ class Encoder(Protocol):
 class PixelsEncoder:
     """The picture itself, made small: no network, no download, 0.01 ms.
 
-    Each frame is resized to 28 x 28 by area, divided by 255 and flattened (D = 2352); not normalised.
+    Each frame is resized to 28 x 28 by area, divided by 255 and flattened (D = 2352); not
+    normalised.
     """
 
     frame_size: int | None = None
@@ -70,14 +74,19 @@ class PixelsEncoder:
     def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Encode (B, H, W, 3) uint8 as (B, 2352) float32 in [0, 1]."""
         small = [cv2.resize(frame, (28, 28), interpolation=cv2.INTER_AREA) for frame in frames]
-        return np.stack(small).reshape(len(frames), -1).astype(np.float32) / np.float32(255)
+        embeddings: NDArray[np.float32] = (
+            np.stack(small).reshape(len(frames), -1).astype(np.float32)
+        )
+        embeddings /= 255
+        return embeddings
 
 
 class TimmEncoder:
-    """A pretrained network of `timm <https://huggingface.co/docs/timm>`_, its pooled features L2-normalised.
+    """A pretrained network of `timm <https://huggingface.co/docs/timm>`_.
 
-    Frames are resized to the network's own input size (area when shrinking, cubic when enlarging; the whole
-    picture, no crop) and standardised by its own mean and standard deviation.
+    The embedding is its pooled features, L2-normalised. Frames are resized to the network's own
+    input size (area when shrinking, cubic when enlarging; the whole picture, no crop) and
+    standardised by its own mean and standard deviation.
 
     Args:
         model: timm's name, for example ``"vit_small_patch16_dinov3.lvd1689m"``.
@@ -116,15 +125,15 @@ class TimmEncoder:
             network = timm.create_model(model, pretrained=True, num_classes=0, **options)
         except Exception as error:  # timm and its hub client raise a dozen unrelated types here
             reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
-            raise ValueError(
-                f"encoder {name!r}: "
-                + (
-                    f"its weights could not be read from {file!r} ({reason})"
-                    if file is not None
-                    else f"its weights could not be downloaded ({reason}): put model.safetensors of "
-                    f"https://huggingface.co/timm/{model} on this machine and ask for '{name}@FILE'"
+            if file is not None:
+                what = f"its weights could not be read from {file!r} ({reason})"
+            else:
+                what = (
+                    f"its weights could not be downloaded ({type(error).__name__}): get "
+                    f"model.safetensors from https://huggingface.co/timm/{model} and add '@' and "
+                    f"that file's path to the encoder's name"
                 )
-            ) from error
+            raise ValueError(f"encoder {name!r}: {what}") from error
         config = timm.data.resolve_model_data_config(network)
         self._torch = torch
         self._device = device or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -166,82 +175,80 @@ def _interpolation(frame: NDArray[np.uint8], size: int) -> int:
 
 def _import_timm() -> tuple[Any, Any]:
     try:
-        import torch
+        torch = import_module("torch")
+        try:
+            return import_module("timm"), torch
+        except RuntimeError as error:
+            # A torchvision built for another torch has no compiled operators. timm only imports it.
+            if "torchvision::nms" not in str(error):
+                raise
+        library = torch.library.Library("torchvision", "DEF")
+        for name in ("nms", "qnms"):
+            library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        _libraries.append(library)  # the operators vanish with the object
+        return import_module("timm"), torch
     except ImportError as error:
-        raise ImportError("this encoder needs torch: pip install 'regil-wrappers[timm]'") from error
-    try:
-        return _timm(), torch
-    except ImportError as error:
-        raise ImportError("this encoder needs timm: pip install 'regil-wrappers[timm]'") from error
-    except RuntimeError as error:
-        # A torchvision built for another torch has no compiled operators. timm only needs it to import.
-        if "torchvision::nms" not in str(error):
-            raise
-    library = torch.library.Library("torchvision", "DEF")
-    library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-    library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-    _libraries.append(library)  # the operators vanish with the object
-    return _timm(), torch
+        raise ImportError(
+            f"timm's encoders need torch and timm ({error}): pip install 'regil-wrappers[timm]'"
+        ) from error
 
 
 _libraries: list[Any] = []
 
 
-def _timm() -> Any:
-    import timm
-
-    return timm
-
-
-def _from_timm(model: str) -> TimmEncoder:
-    name, _, file = model.partition("@")
-    return TimmEncoder(name, file=file or None)
-
-
 _factories: dict[str, Callable[[], Encoder]] = {
     "pixels": PixelsEncoder,
-    # 224: at its own 518 one picture takes a second on a processor.
-    "dinov2": lambda: TimmEncoder("vit_small_patch14_dinov2.lvd142m", size=224),
-    "dinov3": lambda: TimmEncoder("vit_small_patch16_dinov3.lvd1689m"),
+}
+
+#: Short names: timm's model and the side of its input (None: its own).
+_TIMM_NAMES: dict[str, tuple[str, int | None]] = {
+    # At its own 518 pixels one picture takes about a second on a processor.
+    "dinov2": ("vit_small_patch14_dinov2.lvd142m", 224),
+    "dinov3": ("vit_small_patch16_dinov3.lvd1689m", None),
 }
 
 
 def encoder_names() -> list[str]:
     """Names that `make_encoder` takes, ``"timm:<model>"`` standing for all of timm's."""
-    return [*sorted(_factories), "timm:<model>"]
+    return [*sorted([*_factories, *_TIMM_NAMES]), "timm:<model>"]
 
 
 def register_encoder(name: str, factory: Callable[[], Encoder]) -> None:
     """Make an encoder available by name, in this process.
 
     Args:
-        name: what ``encoder=`` takes then; not one that exists, and without a colon.
+        name: what ``encoder=`` takes then; not one that exists, and without ':' and '@'.
         factory: called without arguments, once a process.
 
     Raises:
-        ValueError: if the name is taken or has a colon.
+        ValueError: if the name is taken or has one of these.
     """
-    if name in _factories or ":" in name:
-        raise ValueError(f"encoder name {name!r} is taken or has a colon: choose another")
+    if name in _factories or name in _TIMM_NAMES or ":" in name or "@" in name:
+        raise ValueError(f"encoder name {name!r} is taken, or has ':' or '@': choose another")
     _factories[name] = factory
 
 
 @lru_cache(maxsize=4)
 def make_encoder(name: str) -> Encoder:
-    """The encoder of that name; the same object when asked again, so that environments share its weights.
+    """The encoder of that name; when asked again the same object, so that weights are shared.
 
     Args:
-        name: one of `encoder_names()`; ``"timm:<model>@FILE"`` reads the weights from a file.
+        name: one of `encoder_names()`; ``"timm:<model>@FILE"`` and ``"dinov3@FILE"`` read the
+            weights from a file.
 
     Raises:
         ValueError: if there is no encoder of that name, or its weights cannot be had.
         ImportError: if it needs a package that is not installed.
     """
-    if name.startswith("timm:"):
-        return _from_timm(name.removeprefix("timm:"))
-    if name not in _factories:
-        raise ValueError(f"unknown encoder {name!r}: choose one of {encoder_names()}")
-    return _factories[name]()
+    if name in _factories:
+        return _factories[name]()
+    known, _, file = name.partition("@")
+    if known in _TIMM_NAMES:
+        model, size = _TIMM_NAMES[known]
+        return TimmEncoder(model, file or None, size)
+    if known.startswith("timm:"):
+        return TimmEncoder(known.removeprefix("timm:"), file or None)
+    raise ValueError(f"unknown encoder {name!r}: choose one of {encoder_names()}")
 
 
 _CACHED_DEMONSTRATIONS = 8
@@ -251,12 +258,13 @@ _cache: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
 def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Embeddings of a demonstration's frames, from the cache where possible.
 
-    Frames are encoded one at a time, as they will be in an episode: a network's output depends in its last
-    bits on the size of the batch, and a frame must have distance 0 to itself.
+    Frames are encoded one at a time, as they will be in an episode: a network's output depends in
+    its last bits on the size of the batch, and a frame must have distance 0 to itself.
 
     Args:
         encoder: cached by its ``cache_key`` together with the frames: in this process, and if it is
-            ``slow`` also in the folder ``regil`` of the user's cache (``XDG_CACHE_HOME``, ``~/.cache``).
+            ``slow`` also in the folder ``regil`` of the user's cache (``XDG_CACHE_HOME``,
+            ``~/.cache``).
         frames: (N, H, W, 3) uint8.
 
     Returns:
@@ -269,7 +277,7 @@ def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
     if key is None:
         return _embed(encoder, frames)
     digest = hashlib.sha256(f"{key} {frames.shape}".encode())
-    digest.update(np.ascontiguousarray(frames))
+    digest.update(np.ascontiguousarray(frames).data)
     name = digest.hexdigest()
     if name not in _cache:
         file = _cache_folder() / f"{name}.npz" if getattr(encoder, "slow", False) else None

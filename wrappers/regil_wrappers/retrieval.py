@@ -48,7 +48,7 @@ class Alignment:
 
 
 class Retriever:
-    """Aligns recent frames with one demonstration: candidates, q*, S-DTW (Section 3.1 of the paper).
+    """Aligns recent frames with one demonstration: candidates, q*, S-DTW (the paper's Section 3.1).
 
     One new row of distances a step; older rows are kept.
 
@@ -73,7 +73,8 @@ class Retriever:
         use_encoder_frames: whether memory is ``demo.encoder_frames`` instead of ``demo.frames``.
 
     Raises:
-        ValueError: if the demonstration is shorter than horizon + 1 frames, or an argument is out of range.
+        ValueError: if the demonstration is shorter than horizon + 1 frames, or an argument is out
+            of range.
     """
 
     def __init__(
@@ -95,10 +96,12 @@ class Retriever:
         self.step_pattern: StepPattern = step_pattern
         self.embeddings = embed(self.encoder, frames)
         self._frame_shape = frames.shape[1:]
-        # Equal frames get equal distances to the last bit, whatever order a processor sums in: ties between
-        # idle frames must stay ties.
+        # Equal frames get equal distances to the last bit, whatever order a processor sums in: ties
+        # between idle frames must stay ties.
         first: dict[bytes, int] = {}
-        self._distinct_of = np.array([first.setdefault(y.tobytes(), len(first)) for y in self.embeddings])
+        self._distinct_of = np.array(
+            [first.setdefault(y.tobytes(), len(first)) for y in self.embeddings]
+        )
         _, index = np.unique(self._distinct_of, return_index=True)
         self._distinct = np.ascontiguousarray(self.embeddings[index])
         # Rows of distances, newest last; moved back to the top when the buffer is full.
@@ -121,7 +124,9 @@ class Retriever:
             ValueError: before the first step of an episode.
         """
         if self._alignment is None:
-            raise ValueError("there is no alignment before the first frame: call reset() of the environment")
+            raise ValueError(
+                "there is no alignment before the first frame: call reset() of the environment"
+            )
         return self._alignment
 
     def step(self, frame: NDArray[np.uint8]) -> Alignment:
@@ -146,7 +151,9 @@ class Retriever:
         """The same for a frame that has been encoded already: (D,) float32, finite."""
         distances = squared_distances(embedding, self._distinct)[self._distinct_of]
         if not np.isfinite(distances.sum()):
-            raise ValueError(f"frame {self._steps} of the episode has no finite distance to the demonstration")
+            raise ValueError(
+                f"frame {self._steps} of the episode has no finite distance to the demonstration"
+            )
         candidates = nearest(distances, self.k).tolist()
         self._append(distances)
         q_star = candidates[-1]
@@ -187,7 +194,13 @@ class Retriever:
         return warping_path(self._table, end, self.step_pattern)
 
 
-def check_settings(demo: Demonstration, k: int, horizon: int, step_pattern: str) -> None:
+def check_settings(
+    demo: Demonstration,
+    k: int,
+    horizon: int,
+    step_pattern: str,
+    label: str = "the demonstration",
+) -> None:
     """Refuse settings that do not fit the demonstration, before any long work.
 
     Raises:
@@ -200,11 +213,11 @@ def check_settings(demo: Demonstration, k: int, horizon: int, step_pattern: str)
         raise ValueError(f"step_pattern={step_pattern!r}: choose one of {sorted(STEP_PATTERNS)}")
     if len(demo) < horizon + 1:
         raise ValueError(
-            f"the demonstration has {len(demo)} frames, fewer than horizon + 1 = {horizon + 1}: "
+            f"{label} has {len(demo)} frames, fewer than horizon + 1 = {horizon + 1}: "
             f"choose horizon={len(demo) - 1} or record a longer one"
         )
     if k > len(demo):
-        raise ValueError(f"k={k}: the demonstration has only {len(demo)} frames")
+        raise ValueError(f"k={k}: {label} has only {len(demo)} frames")
     if step_pattern == "strap" and k < (horizon + 1) // 2 + 1:
         raise ValueError(
             f"k={k}: step_pattern 'strap' with horizon={horizon} needs at least "

@@ -52,7 +52,7 @@ def demonstration_tau(embeddings: NDArray[np.float32], gap: int = 5) -> float:
     )
     if not d.sum() > 0:
         raise ValueError(
-            f"the demonstration's frames do not differ from those {gap} frames later, so its reward "
+            f"the demonstration's frames are the same as those {gap} frames later, so the reward "
             f"has no scale: record one that moves"
         )
     return float((d * d).sum() / d.sum())

@@ -1,81 +1,406 @@
 """Wrappers that hold an environment beside one demonstration.
 
 * ``RetrievalGuideWrapper`` - says which action the demonstrator took here
-* ``RetrievalRewardWrapper`` - replaces the reward by how well recent frames follow the demonstration
+* ``RetrievalRewardWrapper`` - replaces the reward by how well recent frames follow the
+  demonstration
 
-Both put an alignment into ``info["retrieval"]``. Stacked, in either order, they share one `Retriever`.
-Frame stacking belongs outside them, action repeat and time limits inside.
+Both put their alignment into ``info["retrieval"]``. Stacked, in either order, they share one
+`Retriever`. Frame stacking belongs outside them, action repeat and time limits inside.
 """
 
 from __future__ import annotations
 
+import math
 import os
-from typing import Any, Literal, SupportsFloat
+from functools import cached_property
+from typing import Any, Literal, SupportsFloat, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.core import ActType, ObsType
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from regil_wrappers.alignment import StepPattern
 from regil_wrappers.demonstration import Demonstration
-from regil_wrappers.encoders import Encoder
+from regil_wrappers.encoders import Encoder, make_encoder
+from regil_wrappers.frames import FrameSource, check_recorded_settings
 from regil_wrappers.retrieval import Alignment, Retriever, check_settings
 from regil_wrappers.rewards import demonstration_tau, sdtw_reward
 
 __all__ = ["RetrievalGuideWrapper", "RetrievalRewardWrapper"]
 
-Demo = str | os.PathLike[str] | Demonstration
-
-# Settings of the environment that decide what its frames look like. Environments of ours state them.
-_SAME_AS_RECORDED = ("camera", "render", "image_size", "action_repeat")
-
-# When a first frame counts as turned: pixels of a 28 x 28 picture that differ by more than _DIFFERENT
-# (of 255, in any channel). Objects elsewhere than in the demonstration change few of them, a turned picture
-# most; a swap of colour channels cannot be mistaken for an object that moved, and may change fewer.
-_DIFFERENT = 25
-_TURNED = 0.25
-_SWAPPED = 0.05
+_REWARDS = ("sdtw",)
 
 
 class _RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
-    """What both wrappers share: one retriever, fed with each new frame by the innermost of them."""
+    """What both share. The innermost one owns the retriever and feeds it, those outside read it."""
+
+    _saved_kwargs: dict[str, Any]
 
     def __init__(
         self,
         env: gym.Env[ObsType, ActType],
         demo: Demonstration,
-        label: str,
-        encoder: str | Encoder,
-        k: int,
-        horizon: int,
-        image: str,
-        step_pattern: StepPattern,
+        settings: dict[str, Any],
+        frames: FrameSource | None,
     ) -> None:
-        settings: dict[str, Any] = {
-            "demo": demo,
-            "encoder": encoder,
-            "k": k,
-            "horizon": horizon,
-            "image": image,
-            "step_pattern": step_pattern,
-        }
-        inner = _inner_retrieval(env)
-        if inner is None:
-            check_settings(demo, k, horizon, step_pattern)
-            check_recorded_settings(env, demo, label)
-            self._frames = _FrameSource(env, demo, label, image)
-        else:
-            check_equal(inner._settings, settings)
         gym.Wrapper.__init__(self, env)
-        self._inner = inner
-        self._settings = settings
-        self._label = label
-        if inner is None:
-            size = _encoder_frame_size(env, demo, encoder)
-            self._frames.encoder_size = size
-            self.retriever = Retriever(
-                demo, encoder, k, horizon, step_pattern, use_encoder_frames=size is not None
+        self.demonstration = demo
+        self.retrieval_settings = settings
+        self._frames = frames
+        if frames is None:
+            self.retriever: Retriever = env.get_wrapper_attr("retriever")
+            return
+        encoder = settings["encoder"]
+        if isinstance(encoder, str):
+            encoder = make_encoder(encoder)
+        larger = getattr(encoder, "frame_size", None) is not None and frames.use_encoder_frames()
+        self.retriever = Retriever(
+            demo,
+            encoder,
+            settings["k"],
+            settings["horizon"],
+            settings["step_pattern"],
+            use_encoder_frames=larger,
+        )
+
+    @property
+    def alignment(self) -> Alignment:
+        """The alignment of the current frame; there is one from the first reset on."""
+        return self.retriever.alignment
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """What `gym.make` rebuilds the stack from; None with objects in place of names."""
+        # A path is saved as text; a Demonstration or an encoder object has no name to save.
+        if not all(isinstance(self._saved_kwargs[key], str) for key in ("demo", "encoder")):
+            return None
+        return super().spec
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ObsType, dict[str, Any]]:
+        """Reset the environment and align its first frame."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        if self._frames is not None:
+            self.retriever.reset()
+            self.retriever.step(self._frames.current(observation))
+        return observation, info
+
+    def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step the environment and align the frame that follows."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._frames is not None:
+            self.retriever.step(self._frames.current(observation))
+        return observation, reward, terminated, truncated, info
+
+    def _with_retrieval(self, info: dict[str, Any], **own: Any) -> dict[str, Any]:
+        a = self.alignment
+        inner = info["retrieval"] if self._frames is None else {}
+        return {
+            **info,
+            "retrieval": {"start": a.start, "end": a.end, "cost": a.cost, **own, **inner},
+        }
+
+
+class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
+    """Says at each step which action the demonstrator took where the agent is now.
+
+    It never changes an action: whoever chooses actions asks `guide_action()`. Observations and
+    rewards pass through. ``info["retrieval"]`` holds ``start``, ``end`` (frames of the
+    demonstration), ``cost`` and ``guide_action``.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from regil_wrappers import RetrievalGuideWrapper
+        >>> env = gym.make("ToyReach-v0")
+        >>> env = RetrievalGuideWrapper(env, demo=toy_demo)
+        >>> observation, info = env.reset(seed=0)
+        >>> done = False
+        >>> while not done:
+        ...     observation, reward, terminated, truncated, info = env.step(env.guide_action())
+        ...     done = terminated or truncated
+        >>> info["is_success"]
+        True
+
+    Args:
+        env: an environment with a Box action space.
+        demo: path of a demonstration; or a `Demonstration`, but such a stack has no ``spec``.
+        encoder: name of an encoder (`regil_wrappers.encoder_names()`), or an object with
+            ``encode(frames: uint8 (B, H, W, 3)) -> float32 (B, D)``, but such a stack has no
+            ``spec``.
+        k: how many nearest frames are candidates.
+        horizon: H, how many frames before the current one are aligned with it.
+        image: where frames come from: "obs" (the observation is the picture), "obs:KEY" (a key of a
+            dict observation) or "render" (``env.render()``, with ``render_mode="rgb_array"``).
+        guide_offset: frames added to the aligned one.
+        guide_patience: after so many steps in which the furthest aligned frame did not advance,
+            play on from that frame, one action a step; None: never.
+        step_pattern: "symmetric" (Eq. 1) or "strap".
+
+    Raises:
+        ValueError: if the demonstration does not fit the environment or an argument is out of
+            range; at the first reset, if the picture is upside down, mirrored or has its colours
+            swapped.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[ObsType, ActType],
+        demo: str | os.PathLike[str] | Demonstration,
+        encoder: str | Encoder = "pixels",
+        k: int = 5,
+        horizon: int = 4,
+        image: str = "obs",
+        guide_offset: int = 0,
+        guide_patience: int | None = None,
+        step_pattern: StepPattern = "symmetric",
+    ) -> None:
+        settings = _settings(demo, encoder, k, horizon, image, step_pattern)
+        loaded, frames = _checked(env, settings)
+        if type(guide_offset) is not int:
+            raise ValueError(f"guide_offset={guide_offset!r}: it must be a whole number of frames")
+        if guide_patience is not None and (type(guide_patience) is not int or guide_patience < 1):
+            raise ValueError(
+                f"guide_patience={guide_patience!r}: it must be at least 1 step, or None"
             )
-        else:
-            self.retriever = inner.retriever
+        self._actions: NDArray[np.float32] = _guide_actions(env, loaded, _label(settings["demo"]))
+
+        gym.utils.RecordConstructorArgs.__init__(
+            self,
+            _disable_deepcopy=True,
+            **settings,
+            guide_offset=guide_offset,
+            guide_patience=guide_patience,
+        )
+        _RetrievalWrapper.__init__(self, env, loaded, settings, frames)
+
+        self.guide_offset = guide_offset
+        self.guide_patience = guide_patience
+        self._furthest = -1
+        self._waiting = 0
+
+    def guide_action(self) -> NDArray[np.float32]:
+        """The demonstrator's action here: (A,) float32, in the environment's own units.
+
+        At the end of the demonstration, its last action.
+
+        Raises:
+            ValueError: before the first reset.
+        """
+        frame = self.alignment.end
+        if self.guide_patience is not None and self._waiting >= self.guide_patience:
+            frame = self._furthest + self._waiting - self.guide_patience
+        frame += self.guide_offset
+        return cast(
+            "NDArray[np.float32]", self._actions[min(max(frame, 0), len(self._actions) - 1)].copy()
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ObsType, dict[str, Any]]:
+        """Reset; ``info["retrieval"]`` holds the alignment and the first guide action."""
+        observation, info = super().reset(seed=seed, options=options)
+        self._furthest, self._waiting = self.alignment.end, 0
+        return observation, self._with_retrieval(info, guide_action=self.guide_action())
+
+    def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step with the given action; ``info["retrieval"]`` holds the guide's for the next step."""
+        observation, reward, terminated, truncated, info = super().step(action)
+        advanced = self.alignment.end > self._furthest
+        self._furthest = max(self._furthest, self.alignment.end)
+        self._waiting = 0 if advanced else self._waiting + 1
+        info = self._with_retrieval(info, guide_action=self.guide_action())
+        return observation, reward, terminated, truncated, info
+
+
+class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
+    """Rewards following the demonstration: r = -(S-DTW cost) / (frames in the window), Eq. 3.
+
+    The reward is 0 along an exact replay and negative otherwise, and depends on nothing that comes
+    later. Observations pass through. ``info["retrieval"]`` holds ``start``, ``end`` (frames of the
+    demonstration), ``cost`` and ``env_reward``, the environment's own.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from regil_wrappers import RetrievalRewardWrapper
+        >>> env = gym.make("ToyReach-v0")
+        >>> env = RetrievalRewardWrapper(env, demo=toy_demo)
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.high)
+        >>> reward <= 0, info["retrieval"]["env_reward"]
+        (True, 0.0)
+
+    Args:
+        env: the environment.
+        demo: path of a demonstration; or a `Demonstration`, but such a stack has no ``spec``.
+        encoder: name of an encoder (`regil_wrappers.encoder_names()`), or an object with
+            ``encode(frames: uint8 (B, H, W, 3)) -> float32 (B, D)``, but such a stack has no
+            ``spec``.
+        k: how many nearest frames are candidates.
+        horizon: H, how many frames before the current one are aligned with it.
+        image: where frames come from: "obs" (the observation is the picture), "obs:KEY" (a key of a
+            dict observation) or "render" (``env.render()``, with ``render_mode="rgb_array"``).
+        reward: "sdtw".
+        mode: "replace" the environment's reward, or "add" to it.
+        weight: factor of this reward.
+        divisor: "window" divides by the frames in the window, "horizon" always by H + 1 as the
+            paper does; they differ in the first H steps of an episode.
+        step_pattern: "symmetric" (Eq. 1) or "strap".
+
+    Raises:
+        ValueError: if the demonstration does not fit the environment or an argument is out of
+            range; at the first reset, if the picture is upside down, mirrored or has its colours
+            swapped.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[ObsType, ActType],
+        demo: str | os.PathLike[str] | Demonstration,
+        encoder: str | Encoder = "pixels",
+        k: int = 5,
+        horizon: int = 4,
+        image: str = "obs",
+        reward: Literal["sdtw"] = "sdtw",
+        mode: Literal["replace", "add"] = "replace",
+        weight: float = 1.0,
+        divisor: Literal["window", "horizon"] = "window",
+        step_pattern: StepPattern = "symmetric",
+    ) -> None:
+        settings = _settings(demo, encoder, k, horizon, image, step_pattern)
+        loaded, frames = _checked(env, settings)
+        for name, value, choices in (
+            ("reward", reward, _REWARDS),
+            ("mode", mode, ("replace", "add")),
+            ("divisor", divisor, ("window", "horizon")),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name}={value!r}: choose one of {list(choices)}")
+        if not isinstance(weight, (int, float)) or not math.isfinite(weight):
+            raise ValueError(f"weight={weight!r}: it must be a finite number")
+
+        gym.utils.RecordConstructorArgs.__init__(
+            self,
+            _disable_deepcopy=True,
+            **settings,
+            reward=reward,
+            mode=mode,
+            weight=weight,
+            divisor=divisor,
+        )
+        _RetrievalWrapper.__init__(self, env, loaded, settings, frames)
+
+        self.mode = mode
+        self.weight = weight
+        self._divided_by_horizon = horizon if divisor == "horizon" else None
+
+    @cached_property
+    def reward_scale(self) -> float:
+        """The reward's own scale: 1 / tau of the demonstration (`rewards.demonstration_tau`).
+
+        Raises:
+            ValueError: if the demonstration does not move.
+        """
+        return 1 / demonstration_tau(self.retriever.embeddings)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ObsType, dict[str, Any]]:
+        """Reset; ``info["retrieval"]`` holds the alignment of the first frame."""
+        observation, info = super().reset(seed=seed, options=options)
+        return observation, self._with_retrieval(info)
+
+    def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step; the environment's own reward goes to ``info["retrieval"]["env_reward"]``."""
+        observation, env_reward, terminated, truncated, info = super().step(action)
+        reward = self.weight * sdtw_reward(self.alignment, self._divided_by_horizon)
+        if self.mode == "add":
+            reward += float(env_reward)
+        info = self._with_retrieval(info, env_reward=float(env_reward))
+        return observation, reward, terminated, truncated, info
+
+
+def _settings(
+    demo: str | os.PathLike[str] | Demonstration,
+    encoder: str | Encoder,
+    k: int,
+    horizon: int,
+    image: str,
+    step_pattern: str,
+) -> dict[str, Any]:
+    """The arguments that decide an alignment, as a specification can hold them."""
+    return {
+        "demo": demo if isinstance(demo, Demonstration) else os.fspath(demo),
+        "encoder": encoder,
+        "k": k,
+        "horizon": horizon,
+        "image": image,
+        "step_pattern": step_pattern,
+    }
+
+
+def _checked(
+    env: gym.Env[Any, Any], settings: dict[str, Any]
+) -> tuple[Demonstration, FrameSource | None]:
+    """Refuse what does not fit, before any long work.
+
+    Returns:
+        the demonstration, and where frames come from: None if a retrieval wrapper further in takes
+        them.
+    """
+    demo = settings["demo"]
+    label = _label(demo)
+    if env.has_wrapper_attr("retrieval_settings"):
+        inside = env.get_wrapper_attr("retrieval_settings")
+        for name, value in settings.items():
+            other = inside[name]
+            if value is other or (isinstance(value, (str, int)) and value == other):
+                continue
+            raise ValueError(
+                f"{name}={_shown(value)}, but the retrieval wrapper inside has {_shown(other)}: "
+                f"wrappers in one stack share one alignment, give both the same"
+            )
+        return env.get_wrapper_attr("demonstration"), None
+    if not isinstance(demo, Demonstration):
+        demo = Demonstration.load(demo)
+    check_settings(demo, settings["k"], settings["horizon"], settings["step_pattern"], label)
+    encoder = settings["encoder"]
+    if not isinstance(encoder, str) and not hasattr(encoder, "encode"):
+        raise ValueError(f"encoder={encoder!r}: give a name, or an object with encode(frames)")
+    check_recorded_settings(env, demo, label)
+    return demo, FrameSource(env, demo, label, settings["image"])
+
+
+def _label(demo: str | Demonstration) -> str:
+    return f"demo {demo!r}" if isinstance(demo, str) else "the demonstration"
+
+
+def _shown(value: Any) -> str:
+    return repr(value) if isinstance(value, (str, int)) else f"<{type(value).__name__}>"
+
+
+def _guide_actions(env: gym.Env[Any, Any], demo: Demonstration, label: str) -> NDArray[np.float32]:
+    """The demonstration's actions, once they are known to fit the environment."""
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+        raise ValueError(
+            f"the action space is {space}: a guide needs continuous actions, a Box of shape (A,)"
+        )
+    if demo.actions is None:
+        raise ValueError(f"{label} has no actions, so it cannot guide: record one that has")
+    if demo.actions.shape[1:] != space.shape:
+        raise ValueError(
+            f"{label} has actions of size {demo.actions.shape[1]} but the environment takes "
+            f"{space.shape[0]}: record it in this environment"
+        )
+    low, high = space.low.astype(np.float32), space.high.astype(np.float32)
+    outside = np.argwhere((demo.actions < low) | (demo.actions > high))
+    if len(outside):
+        i, a = outside[0]
+        raise ValueError(
+            f"{label} has action {demo.actions[i, a]:g} in dimension {a} of step {i} but the "
+            f"environment takes [{low[a]:g}, {high[a]:g}]: record it in this environment"
+        )
+    return demo.actions

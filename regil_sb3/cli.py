@@ -1,0 +1,147 @@
+"""The command line: ``regil record | train | evaluate | report | bench``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="regil", description="Learn a manipulation skill from one demonstration."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    record = commands.add_parser("record", help="record the scripted expert of an environment")
+    record.add_argument("env", help="id of the environment, e.g. regil/metaworld-button-press-v0")
+    record.add_argument("-o", "--out", type=Path, help="file (demos/<id after the slash>.hdf5)")
+    record.add_argument("--seed", type=int, default=0, help="first seed to try (0)")
+
+    train = commands.add_parser("train", help="learn, evaluate, and write a report")
+    train.add_argument("--env", help="id of the environment")
+    train.add_argument("--algo", choices=["td3bc"], default="td3bc")
+    train.add_argument("--demo", type=Path, help="demonstration; recorded when it is not there")
+    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--out", type=Path, help="run folder (runs/<id after the slash>-<seed>)")
+    train.add_argument("--preset", help="a section of zoo_configs/td3bc.yml")
+    train.add_argument("--steps", type=int, help="agent steps")
+    train.add_argument("--episodes", type=int, default=20, help="unseen episodes at the end (20)")
+    train.add_argument("--resume", type=Path, metavar="RUN", help="go on with an interrupted run")
+    train.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="any argument of TD3BC or of the retrieval wrappers, or env_kwargs.NAME",
+    )
+
+    evaluate = commands.add_parser("evaluate", help="evaluate policy, guided replay and BC")
+    evaluate.add_argument("run", type=Path)
+    evaluate.add_argument("--episodes", type=int, default=40)
+
+    report = commands.add_parser("report", help="make the HTML page of a run")
+    report.add_argument("run", type=Path)
+    report.add_argument("-o", "--out", type=Path, help="file (RUN/report.html)")
+
+    bench = commands.add_parser("bench", help="measure, as ratios in one run")
+    bench.add_argument("table", help="retrieval or rendering")
+    return parser
+
+
+def default_demo(env: str) -> Path:
+    """Where ``regil record`` puts a demonstration when it is not told."""
+    return Path("demos") / f"{env.rpartition('/')[2]}.hdf5"
+
+
+def _record(env: str, path: Path, seed: int, env_kwargs: dict[str, Any] | None = None) -> None:
+    from regil_sb3.recording import record_expert
+
+    if path.exists():
+        raise ValueError(f"{path} exists already: choose another file with -o, or remove it")
+    demo = record_expert(env, seed=seed, env_kwargs=env_kwargs)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    demo.save(path)
+    tried = demo.metadata["seeds_tried"]
+    print(
+        f"{path}: {len(demo)} frames, seed {demo.metadata['seed']}, "
+        f"{tried} {'seed' if tried == 1 else 'seeds'} tried"
+    )
+
+
+def _train(args: argparse.Namespace) -> None:
+    from regil_wrappers import Demonstration
+
+    from regil_sb3 import training
+    from regil_sb3.settings import make_settings
+
+    training.keep_freed_memory()
+    training.set_threads()
+    if args.resume is not None:
+        run = args.resume
+        training.resume(run)
+    else:
+        if not args.env:
+            raise ValueError("--env is missing: name an environment, or --resume a run")
+        settings = make_settings(args.env, args.preset, args.seed, args.steps, args.set)
+        run = args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-{args.seed}"
+        if (run / "config.yaml").exists():
+            raise ValueError(
+                f"{run} holds a run already: choose another --out, or go on with --resume {run}"
+            )
+        demo = args.demo or default_demo(args.env)
+        if not demo.exists():
+            _record(args.env, demo, args.seed, settings.env_kwargs)
+        try:
+            training.train(settings, Demonstration.load(demo), run)
+        except KeyboardInterrupt:
+            print(f"\nsaved; go on with: regil train --resume {run}")
+            raise
+    _evaluate(run, args.episodes)
+    _report(run, None)
+
+
+def _evaluate(run: Path, episodes: int) -> None:
+    from regil_sb3 import training
+
+    training.keep_freed_memory()
+    results = training.evaluate_run(run, episodes)
+    print(f"\nSuccess over {episodes} unseen episodes, {results['steps']} steps of learning:")
+    for name, title in (("policy", "policy"), ("guide", "guided replay"), ("bc", "BC on the demo")):
+        if name in results:
+            print(f"  {title:<15} {results[name]['success']:.2f}")
+
+
+def _report(run: Path, out: Path | None) -> None:
+    from regil_sb3.report import write_report
+
+    print(f"report: {write_report(run, out)}")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a command; 0 when it worked, 2 for bad input (one line says what), 130 for Ctrl-C."""
+    args = _parser().parse_args(argv)
+    try:
+        if args.command == "record":
+            _record(args.env, args.out or default_demo(args.env), args.seed)
+        elif args.command == "train":
+            _train(args)
+        elif args.command == "evaluate":
+            _evaluate(args.run, args.episodes)
+        elif args.command == "report":
+            _report(args.run, args.out)
+        elif args.command == "bench":
+            from regil_sb3 import bench
+
+            bench.main(args.table)
+    except KeyboardInterrupt:
+        return 130
+    except (ValueError, OSError, MemoryError, FloatingPointError, ImportError) as error:
+        print(f"regil: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

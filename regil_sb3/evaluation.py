@@ -1,0 +1,118 @@
+"""Success on unseen seeds, the same for every method.
+
+Episode i uses seed ``EVALUATION_SEED + i`` in every run of every method; ``best_model`` is chosen
+on ``SELECTION_SEED + i``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from regil_wrappers import Demonstration
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+EVALUATION_SEED = 1_000_000
+SELECTION_SEED = 2_000_000
+
+Act = Callable[[Any, VecEnv], npt.NDArray[Any]]
+
+
+@dataclass
+class Evaluation:
+    """What happened in the episodes of an evaluation."""
+
+    successes: list[bool] = field(default_factory=list)
+    returns: list[float] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)
+    first_frames: list[npt.NDArray[np.uint8]] = field(default_factory=list)
+    first_actions: list[npt.NDArray[np.float32]] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For ``evaluation.json``; returns are sums of the reward that the policy was trained on."""
+        return {
+            "success": float(np.mean(self.successes)),
+            "episodes": len(self.successes),
+            "successes": self.successes,
+            "returns": self.returns,
+            "lengths": self.lengths,
+        }
+
+    def first_episode(self, metadata: dict[str, Any]) -> Demonstration | None:
+        """The first episode in the format of a demonstration, or None without image frames."""
+        if not self.first_frames:
+            return None
+        successes = np.zeros(len(self.first_frames), bool)
+        successes[-1] = self.successes[0]
+        return Demonstration(
+            frames=np.stack(self.first_frames),
+            actions=np.stack(self.first_actions),
+            successes=successes,
+            metadata={**metadata, "success": self.successes[0]},
+        )
+
+
+def policy_act(model: BaseAlgorithm) -> Act:
+    """The deterministic policy."""
+    return lambda obs, env: model.predict(obs, deterministic=True)[0]
+
+
+def guide_act(obs: Any, env: VecEnv) -> npt.NDArray[Any]:
+    """Guided replay: what ``RetrievalGuideWrapper`` suggests."""
+    return np.stack(env.env_method("guide_action"))
+
+
+def evaluate(
+    act: Act,
+    env: VecEnv,
+    episodes: int,
+    first_seed: int = EVALUATION_SEED,
+    progress: Callable[[Evaluation], None] | None = None,
+) -> Evaluation:
+    """Run whole episodes, one after another, episode i reset with seed ``first_seed + i``.
+
+    Args:
+        act: observation and environment -> action.
+        env: one environment, with the training environment's wrappers.
+        episodes: how many.
+        first_seed: see above.
+        progress: called after each episode.
+
+    Raises:
+        ValueError: more than one environment, or no episode.
+    """
+    if env.num_envs != 1 or episodes < 1:
+        raise ValueError(f"evaluation needs one environment and an episode, not {env.num_envs} and {episodes}")
+    result = Evaluation()
+    for episode in range(episodes):
+        env.seed(first_seed + episode)
+        obs = env.reset()
+        total, length, success, done = 0.0, 0, False, False
+        while not done:
+            if episode == 0:
+                result.first_frames += _frames(obs)
+            action = act(obs, env)
+            if episode == 0:
+                result.first_actions.append(np.array(action[0], np.float32))
+            obs, rewards, dones, infos = env.step(action)
+            total, length, done = total + float(rewards[0]), length + 1, bool(dones[0])
+            success |= bool(infos[0].get("is_success", False))
+        if episode == 0:
+            result.first_frames += _frames(infos[0]["terminal_observation"][None])
+        result.successes.append(success)
+        result.returns.append(total)
+        result.lengths.append(length)
+        if progress is not None:
+            progress(result)
+    return result
+
+
+def _frames(obs: Any) -> list[npt.NDArray[np.uint8]]:
+    """The newest frame of an image observation (1, H, W, n * 3); nothing for other observations."""
+    if isinstance(obs, np.ndarray) and obs.ndim == 4 and obs.dtype == np.uint8:
+        return [obs[0, ..., -3:].copy()]
+    return []

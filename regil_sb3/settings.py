@@ -1,0 +1,193 @@
+"""What a run is made of: a preset of the zoo's YAML, with a user's own values on top."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import inspect
+from dataclasses import asdict, dataclass, field
+from importlib import import_module, resources
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import yaml
+from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
+
+from regil_sb3.td3bc import TD3BC
+
+RETRIEVAL = {
+    "regil_wrappers.RetrievalGuideWrapper": RetrievalGuideWrapper,
+    "regil_wrappers.RetrievalRewardWrapper": RetrievalRewardWrapper,
+}
+_WRAPPER_HOMES = ("regil_wrappers.", "gymnasium.wrappers.", "stable_baselines3.common.")
+_OWN = ("n_timesteps", "n_envs", "frame_stack", "policy", "env_kwargs", "env_wrapper")
+
+
+@dataclass
+class Settings:
+    """Everything needed to make a run again; ``config.yaml`` of a run folder.
+
+    Attributes:
+        env: id of the environment.
+        env_kwargs: for ``gymnasium.make``.
+        env_wrapper: rl-zoo's list, inner first: names, or a name with its arguments.
+        preset: section of the YAML this came from.
+        seed: of environments, networks and sampling.
+        steps: agent steps, all environments together.
+        n_envs: environments that step together.
+        frame_stack: frames in an observation.
+        policy: name of the policy.
+        hyperparams: arguments of ``TD3BC``.
+    """
+
+    env: str
+    preset: str = "default"
+    seed: int = 0
+    steps: int = 15_000
+    n_envs: int = 1
+    frame_stack: int = 2
+    policy: str = "CnnPolicy"
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    env_wrapper: list[Any] = field(default_factory=list)
+    hyperparams: dict[str, Any] = field(default_factory=dict)
+
+    def save(self, path: Path, **facts: Any) -> None:
+        """Write ``config.yaml``; ``facts`` (encoder, versions, ...) go beside the settings."""
+        versions = {name: version(name) for name in ("regil-sb3", "stable-baselines3", "torch")}
+        text = yaml.safe_dump({**asdict(self), **facts, "versions": versions}, sort_keys=False)
+        path.write_text(text, encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: Path) -> Settings:
+        """Read what ``save`` wrote.
+
+        Raises:
+            ValueError: the file is missing or not such a file.
+        """
+        try:
+            read = yaml.safe_load(path.read_text(encoding="utf-8"))
+            return cls(**{name: read[name] for name in cls.__dataclass_fields__})
+        except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{path.parent} is not a run folder of `regil train` ({path.name}: {error!r})"
+            ) from error
+
+    def retrieval(self, name: str) -> Any:
+        """An argument that the retrieval wrappers share, such as ``encoder``."""
+        for entry in self.env_wrapper:
+            if isinstance(entry, dict) and next(iter(entry)) in RETRIEVAL:
+                arguments = next(iter(entry.values())) or {}
+                if name in arguments:
+                    return arguments[name]
+        return inspect.signature(RetrievalRewardWrapper).parameters[name].default
+
+    def wrappers(self, demo: str) -> list[tuple[Any, dict[str, Any]]]:
+        """Wrapper classes with their arguments, inner first; the retrieval ones get ``demo``.
+
+        Raises:
+            ValueError: a name that is no wrapper of the packages allowed here.
+        """
+        out = []
+        for entry in self.env_wrapper:
+            name, arguments = (
+                next(iter(entry.items())) if isinstance(entry, dict) else (entry, None)
+            )
+            arguments = dict(arguments or {})
+            if name in RETRIEVAL:
+                out.append((RETRIEVAL[name], {**arguments, "demo": demo}))
+                continue
+            if not str(name).startswith(_WRAPPER_HOMES):
+                raise ValueError(
+                    f"env_wrapper {name!r}: wrappers named in YAML come from "
+                    f"{', '.join(home.rstrip('.') for home in _WRAPPER_HOMES)}; "
+                    "use another one from Python"
+                )
+            module, _, attribute = name.rpartition(".")
+            try:
+                out.append((getattr(import_module(module), attribute), arguments))
+            except (ImportError, AttributeError) as error:
+                raise ValueError(f"env_wrapper {name!r} does not exist: {error}") from error
+        return out
+
+
+def presets() -> dict[str, Any]:
+    """The sections of ``zoo_configs/td3bc.yml``."""
+    text = (resources.files("regil_sb3.zoo_configs") / "td3bc.yml").read_text(encoding="utf-8")
+    sections: dict[str, Any] = yaml.safe_load(text)
+    return sections
+
+
+def make_settings(
+    env: str,
+    preset: str | None = None,
+    seed: int = 0,
+    steps: int | None = None,
+    overrides: list[str] | None = None,
+) -> Settings:
+    """Take a preset, and put ``KEY=VALUE`` overrides on top.
+
+    Args:
+        env: id of the environment.
+        preset: a section of the YAML; None takes the environment's own, else "default".
+        seed: see ``Settings``.
+        steps: agent steps; None takes the preset's.
+        overrides: "KEY=VALUE" with VALUE as YAML. KEY is an argument of ``TD3BC`` or of the
+            retrieval wrappers, one of the settings above, or ``env_kwargs.NAME``.
+
+    Raises:
+        ValueError: an unknown preset or key.
+    """
+    sections = presets()
+    if preset is None:
+        preset = env if env in sections else "default"
+    if preset not in sections:
+        raise ValueError(f"preset {preset!r} is unknown: use one of {', '.join(sections)}")
+    section = copy.deepcopy(sections[preset])
+    settings = Settings(env=env, preset=preset, seed=seed)
+    settings.steps = section.pop("n_timesteps", settings.steps)
+    for name in _OWN[1:]:
+        if name in section:
+            setattr(settings, name, section.pop(name))
+    settings.hyperparams = section
+    settings.hyperparams.pop("demo", None)  # the run folder's own copy is used
+    for override in overrides or []:
+        key, separator, text = override.partition("=")
+        if not separator:
+            raise ValueError(f"--set {override!r}: write KEY=VALUE")
+        _override(settings, key.strip(), yaml.safe_load(text))
+    if steps is not None:
+        settings.steps = steps
+    known = inspect.signature(TD3BC).parameters
+    for name in settings.hyperparams:
+        if name not in known:
+            raise ValueError(f"preset {preset!r}: {name!r} is no argument of TD3BC")
+    return settings
+
+
+def _override(settings: Settings, key: str, value: Any) -> None:
+    model = set(inspect.signature(TD3BC).parameters) - {"env", "policy", "demo", "seed"}
+    wrappers = {n for c in RETRIEVAL.values() for n in inspect.signature(c).parameters}
+    wrappers -= {"env", "demo"}
+    own = set(_OWN[:4])
+    if key.startswith("env_kwargs."):
+        settings.env_kwargs[key.removeprefix("env_kwargs.")] = value
+    elif key.startswith("policy_kwargs."):
+        name = key.removeprefix("policy_kwargs.")
+        settings.hyperparams.setdefault("policy_kwargs", {})[name] = value
+    elif key == "n_timesteps":
+        settings.steps = value
+    elif key in own:
+        setattr(settings, key, value)
+    elif key in model:
+        settings.hyperparams[key] = value
+    elif key in wrappers:
+        for i, entry in enumerate(settings.env_wrapper):
+            name = next(iter(entry)) if isinstance(entry, dict) else entry
+            if name in RETRIEVAL and key in inspect.signature(RETRIEVAL[name]).parameters:
+                old = (entry[name] or {}) if isinstance(entry, dict) else {}
+                settings.env_wrapper[i] = {name: {**old, key: value}}
+    else:
+        near = difflib.get_close_matches(key, model | wrappers | own, n=3)
+        hint = f": did you mean {' or '.join(near)}?" if near else ""
+        raise ValueError(f"--set {key}: no setting has that name{hint}")

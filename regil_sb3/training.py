@@ -1,0 +1,358 @@
+"""One run, from settings to ``evaluation.json``.
+
+- ``make_env``: an environment with the retrieval wrappers, vectorised and stacked.
+- ``TrainingCallback``: progress, evaluation on the selection seeds, the models on disk.
+- ``train``, ``resume``: learn in a run folder.
+- ``evaluate_run``: policy, guided replay and behaviour cloning on the same unseen seeds.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from regil_wrappers import Demonstration
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
+from tqdm import tqdm
+
+from regil_sb3.evaluation import (
+    EVALUATION_SEED,
+    SELECTION_SEED,
+    Act,
+    Evaluation,
+    evaluate,
+    guide_act,
+    policy_act,
+)
+from regil_sb3.settings import Settings
+from regil_sb3.td3bc import TD3BC
+
+BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
+
+
+def keep_freed_memory() -> None:
+    """Stop glibc from handing freed tensors back to the system and asking for them again.
+
+    On a CPU that nearly halves the time of a convolutional update (docs/performance.md).
+    """
+    if platform.system() == "Linux" and platform.libc_ver()[0] == "glibc":
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+        for parameter, value in ((-3, 1 << 30), (-1, (1 << 31) - 1), (-2, 1 << 28)):
+            mallopt(parameter, value)  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_TOP_PAD
+
+
+def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEnv:
+    """The environment of a run, as SB3 wants it.
+
+    Args:
+        settings: of the run.
+        demo: the demonstration's file, given to the retrieval wrappers.
+        n_envs: instead of the run's own number.
+
+    Raises:
+        ValueError: the environment, its arguments or the demonstration do not fit.
+    """
+    wrappers = settings.wrappers(str(demo))
+
+    def wrap(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+        for wrapper, arguments in wrappers:
+            env = wrapper(env, **arguments)
+        return env
+
+    env: VecEnv = make_vec_env(
+        settings.env,
+        n_envs=n_envs or settings.n_envs,
+        seed=settings.seed,
+        wrapper_class=wrap,
+        env_kwargs=settings.env_kwargs,
+    )
+    if settings.frame_stack > 1:
+        env = VecFrameStack(env, settings.frame_stack)
+    return env
+
+
+def action_repeat(env: VecEnv) -> int:
+    """Frames that pass in one agent step, as far as the environment says."""
+    own = env.get_attr("metadata")[0].get("regil", {})
+    return int(own.get("action_repeat", 1))
+
+
+class _AppendingCSV(CSVOutputFormat):
+    """SB3's CSV log, which goes on where an earlier part of the run stopped."""
+
+    def __init__(self, path: Path) -> None:
+        old = path.read_text(encoding="utf-8") if path.exists() else ""
+        super().__init__(str(path))
+        if old:
+            self.keys = old.splitlines()[0].split(",")
+            self.file.write(old)
+
+
+class TrainingCallback(BaseCallback):
+    """Shows progress, evaluates the policy as it learns, and keeps the models on disk.
+
+    The policy is evaluated for the first time when the warm-up has ended and its BC updates are
+    done, then every ``every`` steps. ``model.zip`` is the last, ``best_model.zip`` the best on the
+    selection seeds; each replaces the old file at once, so that a failed save loses nothing.
+    """
+
+    def __init__(self, run: Path, env: VecEnv, every: int, episodes: int) -> None:
+        super().__init__()
+        self.run = run
+        self.eval_env = env
+        self.every, self.episodes = every, episodes
+        self.best = -1.0
+        self._next = every
+        self._first = True
+        self._repeat = action_repeat(env)
+
+    def _on_training_start(self) -> None:
+        self._next = (self.num_timesteps // self.every + 1) * self.every
+        self._first = not self._td3bc.pretrained
+        total = self._td3bc._total_timesteps
+        self._bar = tqdm(total=total, initial=self.num_timesteps, unit="step", dynamic_ncols=True)
+
+    @property
+    def _td3bc(self) -> TD3BC:
+        assert isinstance(self.model, TD3BC)
+        return self.model
+
+    def _on_rollout_start(self) -> None:
+        if self._first and self._td3bc.pretrained:
+            self._first = False
+            self._evaluate()
+
+    def _on_step(self) -> bool:
+        model = self._td3bc
+        self._bar.update(self.num_timesteps - self._bar.n)
+        if self._bar.n % 50 < model.n_envs:
+            self._describe()
+        self.logger.record("time/frames", self.num_timesteps * self._repeat)
+        if self.num_timesteps >= self._next:
+            self._next += self.every
+            if not model.guided:
+                self._evaluate()
+            else:
+                save_model(model, self.run / "model.zip")
+        return True
+
+    def _describe(self) -> None:
+        model = self._td3bc
+        recent = model.ep_success_buffer
+        success = f"{np.mean(recent):.2f}" if recent else "-"
+        phase = "guide acts" if model.guided else "policy acts"
+        best = f", best {self.best:.2f}" if self.best >= 0 else ""
+        self._bar.set_description_str(phase, refresh=False)
+        self._bar.set_postfix_str(
+            f"success {success}{best}, {model.success_buffer.episodes} episodes kept"
+        )
+
+    def _evaluate(self) -> None:
+        self._bar.set_description_str("evaluating")
+        result = evaluate(policy_act(self.model), self.eval_env, self.episodes, SELECTION_SEED)
+        success = float(np.mean(result.successes))
+        self.logger.record("eval/success_rate", success)
+        self.logger.record("eval/retrieval_reward", float(np.mean(result.returns)))
+        self._td3bc.dump_logs()
+        save_model(self._td3bc, self.run / "model.zip")
+        if success > self.best:
+            self.best = success
+            save_model(self._td3bc, self.run / "best_model.zip")
+
+    def _on_training_end(self) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the progress bar."""
+        self._bar.close()
+
+
+def save_model(model: TD3BC, path: Path) -> None:
+    """Save beside the old file, then replace it in one step."""
+    temporary = path.with_name(f".{path.name}")
+    with temporary.open("wb") as file:
+        model.save(file)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def _save_buffers(model: TD3BC, path: Path) -> None:
+    buffers = {"success": model.success_buffer.state()}
+    if hasattr(model.replay_buffer, "state"):
+        buffers["replay"] = model.replay_buffer.state()
+    arrays = {f"{name}/{k}": v for name, state in buffers.items() for k, v in state.items()}
+    temporary = path.with_name(f".{path.name}")
+    with temporary.open("wb") as file:
+        np.savez(file, **arrays)
+    temporary.replace(path)
+
+
+def _load_buffers(model: TD3BC, path: Path) -> None:
+    with np.load(path, allow_pickle=False) as arrays:
+        for name, buffer in (("success", model.success_buffer), ("replay", model.replay_buffer)):
+            prefix = f"{name}/"
+            state = {k.removeprefix(prefix): arrays[k] for k in arrays if k.startswith(prefix)}
+            if state:
+                buffer.load_state(state)  # type: ignore[union-attr]
+
+
+@contextmanager
+def _environments(settings: Settings, demo: Path) -> Iterator[tuple[VecEnv, VecEnv]]:
+    env = make_env(settings, demo)
+    try:
+        eval_env = make_env(settings, demo, n_envs=1)
+        try:
+            yield env, eval_env
+        finally:
+            eval_env.close()
+    finally:
+        env.close()
+
+
+def train(settings: Settings, demo: Demonstration, run: Path) -> None:
+    """Learn, and leave a run folder with config, demonstration, logs and models.
+
+    Raises:
+        ValueError: the folder holds a run already, or the settings do not fit.
+        KeyboardInterrupt: passed on after everything is saved.
+    """
+    if (run / "config.yaml").exists():
+        raise ValueError(
+            f"{run} holds a run already: choose another --out, or go on with --resume {run}"
+        )
+    run.mkdir(parents=True, exist_ok=True)
+    demo.save(run / "demo.hdf5")
+    with _environments(settings, run / "demo.hdf5") as (env, eval_env):
+        model = TD3BC(settings.policy, env, demo=demo, seed=settings.seed, **settings.hyperparams)
+        settings.save(
+            run / "config.yaml",
+            encoder=settings.retrieval("encoder"),
+            k=settings.retrieval("k"),
+            horizon=settings.retrieval("horizon"),
+            action_repeat=action_repeat(env),
+        )
+        _learn(model, settings, run, eval_env)
+
+
+def resume(run: Path) -> Settings:
+    """Go on where an interrupted run stopped; the open episode is lost.
+
+    Raises:
+        ValueError: no run, or one that has ended already.
+    """
+    settings = Settings.load(run / "config.yaml")
+    if not (run / "buffers.npz").exists():
+        raise ValueError(
+            f"{run} was not interrupted by Ctrl-C, so its replay buffer is not there to go on with: "
+            "start a new run, or use `regil evaluate` on this one"
+        )
+    with _environments(settings, run / "demo.hdf5") as (env, eval_env):
+        model = TD3BC.load(run / "model.zip", env=env, demo=Demonstration.load(run / "demo.hdf5"))
+        _load_buffers(model, run / "buffers.npz")
+        _learn(model, settings, run, eval_env)
+    return settings
+
+
+def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> None:
+    formats = [_AppendingCSV(run / "progress.csv"), TensorBoardOutputFormat(str(run))]
+    model.set_logger(Logger(str(run), formats))
+    every = max(settings.steps // 6, 1)
+    callback = TrainingCallback(run, eval_env, every, episodes=10)
+    fresh = model.num_timesteps == 0
+    try:
+        model.learn(settings.steps - model.num_timesteps, callback, reset_num_timesteps=fresh)
+    except KeyboardInterrupt:
+        callback.close()
+        save_model(model, run / "model.zip")
+        _save_buffers(model, run / "buffers.npz")
+        raise
+    except FloatingPointError:
+        callback.close()
+        raise
+    save_model(model, run / "model.zip")
+    (run / "buffers.npz").unlink(missing_ok=True)
+    model.logger.close()
+
+
+def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int) -> TD3BC:
+    """The "BC" of tables: the run's network, augmentation and batch, on the demonstration alone."""
+    hyperparams = {**settings.hyperparams, "buffer_size": 1, "warmup_steps": 0, "bc_coef": 1.0}
+    model = TD3BC(settings.policy, env, demo=demo, seed=settings.seed, **hyperparams)
+    model.set_logger(Logger(None, []))
+    with tqdm(total=updates, desc="behaviour cloning", unit="update", dynamic_ncols=True) as bar:
+        model.pretrain_bc(updates, progress=lambda done: bar.update(1) and None)
+    return model
+
+
+def evaluate_run(run: Path, episodes: int, bc_updates: int = BC_UPDATES) -> dict[str, Any]:
+    """Evaluate a run's last model, guided replay and BC, and write ``evaluation.json``.
+
+    Args:
+        run: the folder.
+        episodes: unseen episodes, the same for each method.
+        bc_updates: of the behaviour cloning on the demonstration alone; its model is kept.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ValueError: no run folder, or one without a model.
+    """
+    settings = Settings.load(run / "config.yaml")
+    if not (run / "model.zip").exists():
+        raise ValueError(f"{run} has no model.zip yet: train it first")
+    demo = Demonstration.load(run / "demo.hdf5")
+    env = make_env(settings, run / "demo.hdf5", n_envs=1)
+    try:
+        model = TD3BC.load(run / "model.zip")
+        if (run / "bc_model.zip").exists():
+            bc = TD3BC.load(run / "bc_model.zip")
+        else:
+            bc = train_bc(settings, demo, env, bc_updates)
+            save_model(bc, run / "bc_model.zip")
+        results: dict[str, Any] = {
+            "steps": model.num_timesteps,
+            "frames": model.num_timesteps * action_repeat(env),
+        }
+        acts: list[tuple[str, Act]] = [("policy", policy_act(model)), ("bc", policy_act(bc))]
+        if env.has_attr("guide_action"):
+            acts.insert(1, ("guide", guide_act))
+        for name, act in acts:
+            with tqdm(total=episodes, desc=f"evaluating {name}", dynamic_ncols=True) as bar:
+
+                def show(result: Evaluation, bar: Any = bar) -> None:
+                    bar.set_postfix_str(f"success {np.mean(result.successes):.2f}", refresh=False)
+                    bar.update(1)
+
+                result = evaluate(act, env, episodes, EVALUATION_SEED, show)
+            results[name] = result.as_dict()
+            if name == "policy":
+                episode = result.first_episode({**demo.metadata, "seed": EVALUATION_SEED})
+                if episode is not None:
+                    episode.save(run / "episode.hdf5")
+        results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
+    finally:
+        env.close()
+    temporary = run / ".evaluation.json"
+    temporary.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    temporary.replace(run / "evaluation.json")
+    return results
+
+
+def set_threads() -> None:
+    """Let OMP_NUM_THREADS decide, where it is set, over torch's own choice."""
+    if os.environ.get("OMP_NUM_THREADS"):
+        th.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))

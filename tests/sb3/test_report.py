@@ -1,0 +1,301 @@
+"""The report of a synthetic run: what the page has, what it says is missing, what is refused."""
+
+import base64
+import csv
+import json
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from regil_wrappers import Demonstration
+
+from regil_sb3 import report
+from regil_sb3.charts import Line, line_chart
+from regil_sb3.report import write_report
+
+EVIL = "</script><script>alert('x')</script>&\"'"
+
+
+def _film(length, tint, **metadata):
+    """A bright square that moves to the right over a fixed background."""
+    frames = np.full((length, 36, 36, 3), 40, np.uint8)
+    frames[:, ::2] += np.uint8(tint)
+    for t in range(length):
+        x = 28 * t // length
+        frames[t, 10:18, x : x + 8] = 180 + t
+    actions = np.zeros((length - 1, 4), np.float32)
+    return Demonstration(frames, actions=actions, metadata={"control_rate": 40, **metadata})
+
+
+def _row(step):
+    return {
+        "time/total_timesteps": step,
+        "time/guided": int(step <= 4000),
+        "rollout/success_rate": step / 20_000,
+        "rollout/retrieval_reward": -200 + step / 100,
+        "rollout/env_reward": step / 50,
+        "eval/success_rate": step / 16_000 if step % 5000 == 0 else "",
+        "train/bc_coef": 2 - step / 8000,
+        "success_buffer/steps": step / 3,
+        "success_buffer/episodes": step // 300,
+    }
+
+
+def _result(successes):
+    return {"success": float(np.mean(successes)), "episodes": 20, "successes": successes}
+
+
+@pytest.fixture
+def run(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    config = {
+        "env": "regil/metaworld-button-press-v0",
+        "encoder": "pixels",
+        "k": 3,
+        "horizon": 4,
+        "hyperparams": {"bc_coef": 2.0, "note": EVIL},
+    }
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    with (run / "progress.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, _row(0))
+        writer.writeheader()
+        writer.writerows(_row(step) for step in range(500, 15_001, 500))
+    evaluation = {
+        "steps": 15_000,
+        "frames": 30_000,
+        "seeds": list(range(1_000_000, 1_000_020)),
+        "policy": _result([True] * 19 + [False]),
+        "guide": _result([True] * 5 + [False] * 15),
+        "bc": _result([False] * 14 + [True] * 6),
+    }
+    (run / "evaluation.json").write_text(json.dumps(evaluation))
+    _film(30, 0).save(run / "demo.hdf5")
+    _film(40, 6, success=True, seed=1_000_000).save(run / "episode.hdf5")
+    return run
+
+
+class _Page(HTMLParser):
+    """Texts, tags and addresses of a page; raises no error itself, so nesting is checked here."""
+
+    VOID = ("meta", "input", "br")
+    LEAVES = ("rect", "line", "circle", "polyline", "image")
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.addresses, self.words, self.count = [], [], [], {}
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.count[tag] = self.count.get(tag, 0) + 1
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "action", "data", "srcset")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+def _page(run):
+    text = write_report(run).read_text("utf-8")
+    return text, _Page(text)
+
+
+def test_a_whole_run_is_one_page_with_everything(run):
+    text, page = _page(run)
+    assert write_report(run) == run / "report.html"
+    assert [word for word in page.words if word.endswith(" %") and word.count(" ") == 1][:3] == [
+        "95 %",
+        "25 %",
+        "30 %",
+    ]
+    for title in (
+        "Success over steps",
+        "Reward over steps",
+        "Success buffer",
+        "Episodes",
+        "Demonstration and evaluation episode",
+        "Alignment",
+        "Configuration",
+    ):
+        assert f"<h2>{title}</h2>" in text
+    assert text.count('class="yes"') == 19 + 5 + 6
+    assert 'title="seed 1000019: failure"' in text
+    assert "19 of 20<br>" in text
+    assert "unseen episodes after 15,000 steps (30,000 frames)" in text
+    assert "Missing from this run" not in text
+    assert list(run.glob("*.tmp")) == []
+
+
+def test_page_asks_the_network_for_nothing(run):
+    text, page = _page(run)
+    assert page.addresses
+    assert all(address.startswith("data:image/") for address in page.addresses)
+    assert "default-src 'none'" in text
+    assert "url(" not in text
+    assert "@import" not in text
+
+
+def test_both_themes_define_every_colour(run):
+    text, _ = _page(run)
+    light, dark = re.findall(r":root \{(.*?)\}", text, re.DOTALL)
+    used = set(re.findall(r"var\(--([a-z_]+)\)", text)) - {"c"}
+    for theme in (light, dark):
+        assert used | {"corrected_guide"} == set(re.findall(r"--([a-z_]+):", theme))
+
+
+def test_everything_read_from_files_is_escaped(run):
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["env"] = EVIL
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    evaluation = json.loads((run / "evaluation.json").read_text())
+    evaluation["seeds"] = [EVIL] * 20
+    (run / "evaluation.json").write_text(json.dumps(evaluation))
+    _film(40, 6, success=EVIL, control_rate=25).save(run / "episode.hdf5")
+    text, page = _page(run)
+    assert "alert('x')" not in text
+    assert page.count["script"] == 2
+    assert f"ReGIL: {EVIL}" in page.words
+
+
+def test_films_are_whole_sprite_sheets(run):
+    text, _ = _page(run)
+    data = json.loads(re.search(r'id="film-data">(.*?)</script>', text).group(1))
+    assert data["rate"] == 40
+    assert [clip["length"] for clip in data["clips"]] == [30, 40]
+    for clip, film in zip(data["clips"], ("demo", "episode"), strict=True):
+        code = np.frombuffer(base64.b64decode(clip["sprite"].split(",")[1]), np.uint8)
+        sheet = cv2.cvtColor(cv2.imdecode(code, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        frames = Demonstration.load(run / f"{film}.hdf5").frames
+        for i, frame in enumerate(frames):
+            y, x = divmod(i, clip["columns"])
+            tile = sheet[36 * y : 36 * (y + 1), 36 * x : 36 * (x + 1)].astype(int)
+            assert np.abs(tile - frame).mean() < 4
+    # The episode moves at 3/4 of the demonstration's pace.
+    assert data["ends"][0] <= 1
+    assert data["ends"][-1] >= 27
+
+
+def test_alignment_is_the_retrievers(run):
+    demo = Demonstration.load(run / "demo.hdf5")
+    aligned = report._align(demo, demo, {"encoder": "pixels", "k": 3, "horizon": 4})
+    assert aligned.ends == list(range(30))
+    assert aligned.distances.shape == (30, 30)
+    assert np.diag(aligned.distances).max() == 0
+    assert all(t == j for path in aligned.paths for t, j in path)
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["episode.hdf5"], "episode.hdf5 is not there"),
+        (["demo.hdf5"], "demo.hdf5 is not there"),
+        (["evaluation.json"], "evaluation.json is not there"),
+        (["progress.csv"], "progress.csv is not there"),
+        (["config.yaml"], "config.yaml is not there"),
+        (["demo.hdf5", "episode.hdf5", "evaluation.json", "progress.csv"], "no training progress"),
+        (["demo.hdf5", "episode.hdf5", "config.yaml", "progress.csv"], "no training progress"),
+    ],
+)
+def test_what_is_missing_is_said(run, names, said):
+    for name in names:
+        (run / name).unlink()
+    text, _ = _page(run)
+    assert "Missing from this run" in text
+    assert said in text
+
+
+@pytest.mark.parametrize(
+    "name", ["config.yaml", "progress.csv", "evaluation.json", "demo.hdf5", "episode.hdf5"]
+)
+@pytest.mark.parametrize("content", [b"", b"\x00\x89{[", b"[1, 2]", b'{"policy": 3, "seeds": 4'])
+def test_a_broken_file_costs_its_part_of_the_page_only(run, name, content):
+    (run / name).write_bytes(content)
+    text, _ = _page(run)
+    assert "Missing from this run" in text
+    assert "<h2>Episodes</h2>" in text or name == "evaluation.json"
+
+
+def test_a_run_interrupted_while_it_wrote_a_line(run):
+    whole = (run / "progress.csv").read_text()
+    (run / "progress.csv").write_text(whole[: len(whole) - 40] + "\n7000,nan,inf,x,-,,,,,,9,9\n")
+    text, _ = _page(run)
+    assert "<h2>Success over steps</h2>" in text
+    assert "nan" not in re.sub(r"base64,[^\"]*", "", text)
+
+
+def test_results_of_another_shape_count_as_not_evaluated(run):
+    (run / "evaluation.json").write_text('{"policy": 3, "guide": {"success": "x"}, "seeds": 4}')
+    text, _ = _page(run)
+    assert "not evaluated: Policy, Guided replay, BC alone" in text
+
+
+def test_only_what_was_evaluated_is_compared(run):
+    (run / "evaluation.json").write_text(json.dumps({"policy": {"success": 0.5, "episodes": 4}}))
+    text, _ = _page(run)
+    assert "2 of 4<br>" in text
+    assert "not evaluated: Guided replay, BC alone" in text
+
+
+def test_an_encoder_that_is_not_here_costs_the_alignment_only(run):
+    (run / "config.yaml").write_text("encoder: no-such-encoder\n")
+    text, _ = _page(run)
+    assert "no-such-encoder" in text
+    assert "<h2>Alignment</h2>" not in text
+    assert "<h2>Demonstration and evaluation episode</h2>" in text
+
+
+def test_out_is_where_the_page_goes(run, tmp_path):
+    out = tmp_path / "new" / "page.html"
+    assert write_report(str(run), str(out)) == out
+    assert out.is_file()
+    assert not (run / "report.html").exists()
+    with pytest.raises(ValueError, match=r"^out '.*' is a folder"):
+        write_report(run, tmp_path)
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path):
+    (tmp_path / "report.html").write_text("mine")
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(ValueError, match="is not a run folder") as error:
+            write_report(folder)
+        assert "\n" not in str(error.value)
+    assert (tmp_path / "report.html").read_text() == "mine"
+
+
+def test_guided_stretches_are_joined():
+    rows = [{"time/total_timesteps": s, "time/guided": g} for s, g in ((10, 1), (20, 1), (30, 0))]
+    assert report._guided(rows) == [(0, 20)]
+    rows.append({"time/total_timesteps": 40, "time/guided": 1})
+    assert report._guided(rows) == [(0, 20), (30, 40)]
+
+
+def test_wilson_interval_is_the_published_one():
+    # Newcombe (1998), Table I, score method without continuity correction: 15/148 and 0/20.
+    assert report._wilson(15, 148) == pytest.approx((6.24, 16.05), abs=0.1)
+    assert report._wilson(0, 20) == pytest.approx((0.0, 16.11), abs=0.01)
+
+
+@pytest.mark.parametrize("values", [[0.0], [5.0, 5.0], [-1e-9, 1e9], [-2.0, -1.0], [0.0, 0.0]])
+def test_charts_draw_any_finite_values_inside_their_frame(values):
+    svg = line_chart([Line("a", "policy", list(enumerate(values)))])
+    numbers = re.findall(r'points="([^"]*)"', svg)
+    for x, y in (pair.split(",") for points in numbers for pair in points.split()):
+        assert 0 <= float(x) <= 480
+        assert 0 <= float(y) <= 290
+
+
+def test_a_chart_without_points_is_nothing():
+    assert line_chart([Line("a", "policy", [])], [(0, 1)]) == ""

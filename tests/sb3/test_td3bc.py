@@ -1,0 +1,344 @@
+"""TD3BC: against TD3 itself, and what the warm-up stores, keeps and trains."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from regil_wrappers import Demonstration
+from stable_baselines3 import TD3
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
+
+from regil_sb3 import TD3BC
+
+OFF = {
+    "bc_coef": 0.0,
+    "warmup_steps": 0,
+    "actor_q": "q1",
+    "normalize_q": False,
+    "reward_scale": 1.0,
+    "exploration_std": 0.0,
+}
+TD3_OWN = {
+    "learning_rate": 1e-3,
+    "buffer_size": 10_000,
+    "learning_starts": 100,
+    "batch_size": 32,
+    "train_freq": 1,
+    "gradient_steps": 1,
+    "n_steps": 1,
+    "target_noise_clip": 0.5,
+    "seed": 3,
+    "device": "cpu",
+}
+
+
+class Reach(gym.Env):
+    """A white dot goes where it is sent; success in the right third. The guide goes right."""
+
+    LENGTH = 12
+
+    def __init__(self, action_high=1.0, reward=None, dict_obs=False):
+        self.image = spaces.Box(0, 255, (40, 40, 3), np.uint8)
+        self.dict_obs = dict_obs
+        self.observation_space = (
+            spaces.Dict({"x": spaces.Box(-1, 1, (1,), np.float32)}) if dict_obs else self.image
+        )
+        self.action_space = spaces.Box(-action_high, action_high, (2,), np.float32)
+        self.reward = reward
+        self.executed = []
+
+    def _obs(self):
+        if self.dict_obs:
+            return {"x": np.array([self.x / 40], np.float32)}
+        frame = np.zeros((40, 40, 3), np.uint8)
+        x = int(np.clip(self.x, 0, 36))
+        frame[18:22, x : x + 4] = 255
+        return frame
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = float(self.np_random.uniform(0, 12))
+        self.t = 0
+        return self._obs(), {}
+
+    def guide_action(self):
+        return np.array([self.np_random.uniform(0.5, 0.9), 0.1], np.float32) * self.action_space.high
+
+    def step(self, action):
+        self.executed.append(np.array(action))
+        self.x += 4 * float(action[0] / self.action_space.high[0])
+        self.t += 1
+        success = self.x > 27
+        reward = -1.0 if self.reward is None else self.reward(self)
+        info = {"is_success": success, "retrieval": {"env_reward": 5.0}}
+        return self._obs(), reward, success, not success and self.t >= self.LENGTH, info
+
+
+def demonstration(high=1.0):
+    env = Reach(high)
+    frame, _ = env.reset(seed=0)
+    frames, actions, done = [frame], [], False
+    while not done:
+        actions.append(np.array([0.7, 0.1], np.float32) * high)
+        frame, _, done, _, _ = env.step(actions[-1])
+        frames.append(frame)
+    return Demonstration(frames=np.stack(frames), actions=np.stack(actions))
+
+
+def stacked(n_envs=1, n_stack=2, vec=DummyVecEnv, **kwargs):
+    return VecFrameStack(vec([lambda: Reach(**kwargs) for _ in range(n_envs)]), n_stack)
+
+
+def small(env, **kwargs):
+    settings = {
+        "demo": demonstration(),
+        "buffer_size": 2_000,
+        "learning_starts": 20,
+        "batch_size": 8,
+        "warmup_steps": 60,
+        "bc_pretrain_steps": 3,
+        "seed": 0,
+        "device": "cpu",
+    }
+    return TD3BC("CnnPolicy", env, **{**settings, **kwargs})
+
+
+def test_is_td3_to_the_last_bit_when_switched_off():
+    # each seeds the global generators when it is built, so one learns before the next is built
+    td3 = TD3("MlpPolicy", "Pendulum-v1", **TD3_OWN).learn(1_000)
+    ours = TD3BC("MlpPolicy", "Pendulum-v1", **TD3_OWN, **OFF).learn(1_000)
+    expected, got = td3.policy.state_dict(), ours.policy.state_dict()
+    assert expected.keys() == got.keys()
+    for name, value in expected.items():
+        assert th.equal(value, got[name]), name
+    initial = TD3BC("MlpPolicy", "Pendulum-v1", **TD3_OWN, **OFF).policy.state_dict()
+    assert not any(th.equal(v, got[k]) for k, v in initial.items() if k.endswith("mu.0.weight"))
+
+
+@pytest.mark.parametrize("n_envs", [1, 2, 3])
+@pytest.mark.parametrize("high", [1.0, 3.0])
+def test_stored_action_is_the_executed_one(n_envs, high):
+    envs = [Reach(high) for _ in range(n_envs)]
+    env = VecFrameStack(DummyVecEnv([lambda e=e: e for e in envs]), 2)
+    model = small(env, demo=demonstration(high))
+    model.learn(120)
+    stored = model.replay_buffer.actions[: model.replay_buffer.total]
+    assert len(stored) == 120 // n_envs
+    for i, one in enumerate(envs):
+        np.testing.assert_allclose(stored[:, i] * high, np.stack(one.executed), atol=1e-6)
+
+
+def test_guide_acts_until_the_episode_begun_in_warmup_has_ended():
+    model = small(stacked(), warmup_steps=15, exploration_std=0.0, learning_starts=0)
+    model.learn(60)
+    second = model.replay_buffer.actions[: model.replay_buffer.total, 0, 1]
+    guided = np.isclose(second, 0.1)
+    ends = np.flatnonzero(model.replay_buffer.dones[:60, 0])
+    last = ends[ends >= 14][0]
+    assert guided[: last + 1].all()
+    assert not guided[last + 1 :].any()
+
+
+def test_success_buffer_takes_whole_successful_guided_episodes():
+    demo = demonstration()
+    model = small(stacked(n_envs=3))
+    model.learn(150)
+    done = model.replay_buffer.dones.astype(bool) & ~model.replay_buffer.timeouts.astype(bool)
+    assert model.success_buffer.episodes > 3
+    assert model.success_buffer.steps > len(demo.actions)
+    _, actions = model.success_buffer.sample(300)
+    assert ((actions[:, 0] > 0.4) & (actions[:, 0] < 0.95)).all()  # no policy action among them
+    assert done.any()
+
+
+def test_no_success_leaves_the_demonstration_alone(monkeypatch):
+    monkeypatch.setattr(Reach, "guide_action", lambda self: np.array([-0.5, 0.0], np.float32))
+    model = small(stacked())
+    model.learn(100)
+    assert model.success_buffer.episodes == 1
+    assert model.num_timesteps == 100
+
+
+def test_demonstration_is_stacked_as_the_policy_sees_it():
+    demo = demonstration()
+    model = small(stacked(n_stack=3))
+    np.random.seed(0)
+    observations, _ = model.success_buffer.sample(200)
+    assert observations.shape == (200, 9, 40, 40)
+    first = [o for o in observations if not o[:6].any()]
+    assert first, "the first step has zeros before it, as VecFrameStack pads"
+    assert np.array_equal(first[0][6:], demo.frames[0].transpose(2, 0, 1))
+
+
+@pytest.mark.parametrize(
+    ("coef", "floor", "steps", "at", "expected"),
+    [(2.0, 0.1, None, 0, 2.0), (2.0, 0.1, None, 50, 1.0), (2.0, 0.1, None, 100, 0.2), (3.0, 0.0, 40, 40, 0.0)],
+)
+def test_lambda(coef, floor, steps, at, expected):
+    model = small(stacked(), bc_coef=coef, bc_floor=floor, bc_steps=steps)
+    model._total_timesteps, model.num_timesteps = 100, at
+    assert model.bc_coef_now() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_q_coef_zero_keeps_the_critic_out_of_the_actors_encoder(shared):
+    # a BC term too small to move anything, so that whatever moves was moved by the critic
+    model = small(
+        stacked(), q_coef=0.0, bc_coef=1e-30, bc_pretrain_steps=0,
+        policy_kwargs={"shared_encoder": shared},
+    )  # fmt: skip
+    before = {k: v.clone() for k, v in model.actor.features_extractor.state_dict().items()}
+    q_before = model.critic.q_networks[0][0].weight.clone()
+    model.learn(60)
+    after = model.actor.features_extractor.state_dict()
+    assert all(th.equal(before[k], after[k]) for k in before)
+    assert not th.equal(q_before, model.critic.q_networks[0][0].weight)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_shared_encoder_is_one_module(shared):
+    model = small(stacked(), policy_kwargs={"shared_encoder": shared})
+    same = model.actor.features_extractor is model.critic.features_extractor
+    assert same == shared
+    model.learn(100)
+    ids = {id(p) for p in model.critic.parameters()}
+    assert any(id(p) in ids for p in model.actor.parameters()) == shared
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "name"),
+    [
+        ({"warmup_steps": 0}, "BC_RL"),
+        ({"bc_coef": 0.0}, "ReG_RL"),
+        ({"bc_coef": 0.0, "warmup_steps": 0, "demo": None}, "RL"),
+        ({"q_coef": 0.0}, "ReG_BC"),
+        ({"bc_loss": "nll", "bootstrap_success": True, "target_policy_noise": 0.0}, "paper"),
+    ],
+)
+def test_ablations_are_settings(kwargs, name):
+    model = small(stacked(), **kwargs)
+    before = [p.clone() for p in model.actor.parameters()]
+    model.learn(100)
+    assert any(not th.equal(a, b) for a, b in zip(before, model.actor.parameters(), strict=True)), name
+
+
+@pytest.mark.parametrize("n_envs", [1, 2, 8])
+def test_one_update_for_every_two_transitions(n_envs):
+    model = small(stacked(n_envs=n_envs), learning_starts=16)
+    model.learn(96)
+    assert abs(model._n_updates - (96 - 16) / 2) <= n_envs
+
+
+def test_bc_learns_the_demonstration():
+    model = small(stacked(), policy_kwargs={"random_shift": 0})
+    model.set_logger(__import__("stable_baselines3").common.logger.Logger(None, []))
+    before = model._bc_term().item()
+    model.pretrain_bc(150)
+    assert model._bc_term().item() < 0.1 * before
+    for a, b in zip(model.actor.parameters(), model.actor_target.parameters(), strict=True):
+        assert th.equal(a, b)
+
+
+def test_reward_scale_comes_from_the_environment(monkeypatch):
+    monkeypatch.setattr(Reach, "reward_scale", 0.25, raising=False)
+    model = small(stacked())
+    model.learn(50)
+    assert model.used_reward_scale == 0.25
+    assert set(np.unique(model.replay_buffer.rewards[:50])) == {-1.0}  # kept raw
+    assert small(stacked(), reward_scale=3.0).learn(30).used_reward_scale == 3.0
+
+
+def test_nan_reward_stops_with_step_and_cause():
+    model = small(stacked(reward=lambda env: np.nan if env.t == 3 else -1.0))
+    with pytest.raises(FloatingPointError, match="reward of environment 0 is not finite at step 3"):
+        model.learn(50)
+
+
+def test_nan_loss_stops_with_step_and_cause():
+    model = small(stacked(reward=lambda env: 1e30), reward_scale=1e30)
+    with pytest.raises(FloatingPointError, match="critic loss is"):
+        model.learn(50)
+
+
+def test_logs_under_fixed_names(tmp_path):
+    from stable_baselines3.common.logger import configure
+
+    model = small(stacked(n_envs=2))
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(200)
+    header = (tmp_path / "progress.csv").read_text().splitlines()[0].split(",")
+    for name in (
+        "rollout/success_rate", "rollout/env_reward", "rollout/retrieval_reward", "train/bc_loss",
+        "train/bc_coef", "success_buffer/steps", "success_buffer/episodes", "time/guided",
+    ):  # fmt: skip
+        assert name in header
+
+
+def test_saves_without_demonstration_and_buffers_and_loads(tmp_path):
+    env = stacked()
+    model = small(env)
+    model.learn(80)
+    model.save(tmp_path / "model")
+    assert (tmp_path / "model.zip").stat().st_size < 12e6
+    loaded = TD3BC.load(tmp_path / "model", env=env, demo=demonstration())
+    obs = env.reset()
+    assert np.array_equal(model.predict(obs)[0], loaded.predict(obs)[0])
+    loaded.learn(40, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 120
+    alone = TD3BC.load(tmp_path / "model")
+    assert np.array_equal(model.predict(obs)[0], alone.predict(obs)[0])
+
+
+def test_subprocesses_and_dict_observations():
+    model = small(stacked(n_envs=2, vec=SubprocVecEnv))
+    model.learn(70)
+    assert model.success_buffer.episodes > 1
+    model.env.close()
+    demo = demonstration()
+    with_x = Demonstration(
+        frames=demo.frames,
+        actions=demo.actions,
+        observations={"x": np.linspace(0, 1, len(demo))[:, None].astype(np.float32)},
+    )
+    env = DummyVecEnv([lambda: Reach(dict_obs=True)])
+    model = TD3BC("MultiInputPolicy", env, demo=with_x, n_steps=1, warmup_steps=40, learning_starts=10,
+                  batch_size=8, buffer_size=500, device="cpu")  # fmt: skip
+    model.learn(80)
+    assert model.success_buffer.episodes > 1
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"demo": None}, "needs demo="),
+        ({"q_coef": 0.0, "bc_coef": 0.0}, "nothing to learn from"),
+        ({"bc_loss": "huber"}, "use one of mse, nll"),
+        ({"actor_q": "q2"}, "use one of min, q1"),
+        ({"demo": "no-such-file.hdf5"}, "no-such-file.hdf5"),
+        ({"success_buffer_size": 0}, "success_buffer_size is 0"),
+        ({"policy_kwargs": {"share_features_extractor": True}}, "shared_encoder"),
+        ({"policy_kwargs": {"features_extractor_class": "vgg"}}, "conv, resnet18"),
+    ],
+)
+def test_bad_arguments(kwargs, message):
+    with pytest.raises((ValueError, OSError), match=message):
+        small(stacked(), **kwargs)
+
+
+def test_bad_combinations():
+    demo = demonstration()
+    with pytest.raises(ValueError, match="has no actions"):
+        small(stacked(), demo=Demonstration(frames=demo.frames))
+    small_frames = Demonstration(frames=demo.frames[:, :36, :36], actions=demo.actions)
+    with pytest.raises(ValueError, match="36x36 frames .* policy sees 40x40"):
+        small(stacked(), demo=small_frames)
+    with pytest.raises(ValueError, match="n_steps=3 with dict observations"):
+        TD3BC("MultiInputPolicy", DummyVecEnv([lambda: Reach(dict_obs=True)]), demo=demo)
+    with pytest.raises(ValueError, match="observations="):
+        TD3BC("MultiInputPolicy", DummyVecEnv([lambda: Reach(dict_obs=True)]), demo=demo, n_steps=1)
+    pendulum = TD3BC("MlpPolicy", "Pendulum-v1", **TD3_OWN, **{**OFF, "warmup_steps": 10})
+    with pytest.raises(ValueError, match="needs a guide"):
+        pendulum.learn(20)

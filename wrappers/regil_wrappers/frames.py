@@ -1,0 +1,211 @@
+"""Where an environment's pictures come from, and whether a demonstration's compare with them.
+
+* ``FrameSource`` - takes the picture out of an observation, a render or a larger frame
+* ``check_recorded_settings`` - camera, render settings and action repeat are those of the recording
+* ``check_size``, ``check_upright`` - two first frames have one size and are the same way up
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import cv2
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from regil_wrappers.demonstration import Demonstration
+
+__all__ = ["FrameSource", "check_recorded_settings", "check_size", "check_upright"]
+
+# What decides how frames look and follow each other, where an environment states it.
+_AS_RECORDED = ("camera", "render", "action_repeat")
+
+# A first frame counts as turned when most of a 28 x 28 picture differs from the demonstration's (by
+# more than _DIFFERENT of 255 in some channel) and turning it leaves less than half of that. Objects
+# at other places change fewer pixels than _TURNED; exchanged colours cannot come from an object
+# that moved, so _SWAPPED is smaller.
+_DIFFERENT = 25
+_TURNED = 0.25
+_SWAPPED = 0.05
+
+
+class FrameSource:
+    """Takes the current picture of an environment, the way the demonstration's was taken.
+
+    Args:
+        env: the environment.
+        demo: the demonstration that pictures will be compared with.
+        label: what errors call it.
+        image: "obs", "obs:KEY" or "render".
+
+    Raises:
+        ValueError: if there is no such picture, or it has another size than the demonstration's.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], demo: Demonstration, label: str, image: str) -> None:
+        self._env = env
+        self._demo = demo
+        self._label = label
+        self._render = image == "render"
+        self._key: str | None = None
+        self._channels_first = False
+        self._first_is_checked = False
+        self._encoder_size: int | None = None
+        if self._render:
+            if env.render_mode != "rgb_array":
+                raise ValueError(
+                    f"image='render' needs render_mode='rgb_array', but the environment was made "
+                    f"with {env.render_mode!r}"
+                )
+            return
+        space: gym.Space[Any] = env.observation_space
+        if isinstance(space, gym.spaces.Dict):
+            pictures = [name for name, inside in space.spaces.items() if _is_picture(inside)]
+            self._key = image.removeprefix("obs:") if image.startswith("obs:") else None
+            if self._key not in pictures:
+                raise ValueError(
+                    f"image={image!r} with dict observations: use one of "
+                    f"{[f'obs:{name}' for name in pictures] + ['render']}"
+                )
+            space = space.spaces[self._key]
+        elif image != "obs":
+            raise ValueError(
+                f"image={image!r}: use 'obs' or 'render' ('obs:KEY' needs dict observations)"
+            )
+        if not _is_picture(space):
+            several = isinstance(space, gym.spaces.Box) and len(space.shape) == 3
+            raise ValueError(
+                f"observations are {space.dtype} {space.shape}, not one RGB picture "
+                f"uint8 (H, W, 3): "
+                + ("put frame stacking outside this wrapper" if several else "use image='render'")
+            )
+        height, width, depth = cast("tuple[int, int, int]", space.shape)
+        self._channels_first = depth != 3
+        size = (width, depth) if self._channels_first else (height, width)
+        check_size(size, demo.frames.shape[1:3], label)
+
+    def use_encoder_frames(self) -> bool:
+        """Take the environment's larger pictures from now on, where there are such.
+
+        They are asked for in the size that was recorded: only pictures rendered alike compare.
+
+        Returns:
+            whether both have them.
+        """
+        larger = self._demo.encoder_frames
+        if larger is None or not self._env.has_wrapper_attr("encoder_frame"):
+            return False
+        self._encoder_size = larger.shape[1]
+        return True
+
+    def current(self, observation: Any) -> NDArray[np.uint8]:
+        """The current picture, (H, W, 3) uint8; the very first one is compared with the recording.
+
+        Args:
+            observation: the environment's last observation.
+
+        Raises:
+            ValueError: if the first picture has another size or is not the same way up.
+        """
+        if self._encoder_size is not None:
+            frame = self._env.get_wrapper_attr("encoder_frame")(self._encoder_size)
+            recorded = cast("NDArray[np.uint8]", self._demo.encoder_frames)[0]
+        else:
+            frame = self._env.render() if self._render else observation
+            recorded = self._demo.frames[0]
+        if self._key is not None:
+            frame = frame[self._key]
+        if self._channels_first:
+            frame = np.moveaxis(frame, 0, -1)
+        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3:
+            raise ValueError(
+                f"the environment's picture is not a uint8 array (H, W, 3): {frame!r:.60}"
+            )
+        if not self._first_is_checked:
+            check_size(frame.shape[:2], recorded.shape[:2], self._label)
+            check_upright(frame, recorded, self._label)
+            self._first_is_checked = True
+        return frame
+
+
+def _is_picture(space: gym.Space[Any]) -> bool:
+    return (
+        isinstance(space, gym.spaces.Box)
+        and space.dtype == np.uint8
+        and len(space.shape) == 3
+        and 3 in (space.shape[0], space.shape[2])
+    )
+
+
+def check_recorded_settings(env: gym.Env[Any, Any], demo: Demonstration, label: str) -> None:
+    """Refuse a camera, render settings or action repeat other than the recording's.
+
+    Environments that do not state theirs (``metadata["regil"]``) pass.
+
+    Raises:
+        ValueError: naming the setting and both values.
+    """
+    here = env.unwrapped.metadata.get("regil") or {}
+    for name in _AS_RECORDED:
+        recorded = demo.metadata[name]
+        if recorded not in (None, {}) and here.get(name, recorded) != recorded:
+            raise ValueError(
+                f"{label} was recorded with {name} {recorded!r} but the environment has "
+                f"{here[name]!r}: make the environment with the recorded one, or record again"
+            )
+
+
+def check_size(size: tuple[int, ...], recorded: tuple[int, ...], label: str) -> None:
+    """Refuse pictures of another size than the recording's, both (height, width) in pixels.
+
+    Raises:
+        ValueError: naming both.
+    """
+    if size != recorded:
+        height, width = size
+        again = f"with --size {height}" if height == width else "at that size"
+        raise ValueError(
+            f"{label} has {recorded[0]}x{recorded[1]} frames but the environment gives "
+            f"{height}x{width}: record it again {again}"
+        )
+
+
+def check_upright(frame: NDArray[np.uint8], recorded: NDArray[np.uint8], label: str) -> None:
+    """Refuse a first frame that is the recording's upside down, mirrored or with colours exchanged.
+
+    Args:
+        frame: (H, W, 3) uint8, the environment's first frame.
+        recorded: (H, W, 3) uint8, the demonstration's first frame.
+        label: what the error calls the demonstration.
+
+    Raises:
+        ValueError: naming what was done to it.
+    """
+    here, there = (
+        cv2.resize(picture, (28, 28), interpolation=cv2.INTER_AREA).astype(np.int16)
+        for picture in (frame, recorded)
+    )
+
+    def changed(picture: NDArray[np.int16]) -> float:
+        return float((np.abs(picture - there).max(axis=2) > _DIFFERENT).mean())
+
+    turned = {
+        "upside down": here[::-1],
+        "mirrored": here[:, ::-1],
+        "turned by 180 degrees": here[::-1, ::-1],
+    }
+    swapped = {
+        f"{name}, with red and blue exchanged": picture[..., ::-1]
+        for name, picture in turned.items()
+    }
+    for least, variants in (
+        (_SWAPPED, {"with red and blue exchanged": here[..., ::-1]}),
+        (_TURNED, turned | swapped),
+    ):
+        name, picture = min(variants.items(), key=lambda variant: changed(variant[1]))
+        if changed(here) > least and changed(picture) < 0.5 * changed(here):
+            raise ValueError(
+                f"the environment's first frame is that of {label} {name}: "
+                f"fix the environment's picture, or record again"
+            )
