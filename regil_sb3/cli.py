@@ -18,6 +18,12 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("env", help="id of the environment, e.g. regil/metaworld-button-press-v0")
     record.add_argument("-o", "--out", type=Path, help="file (demos/<id after the slash>.hdf5)")
     record.add_argument("--seed", type=int, default=0, help="first seed to try (0)")
+    record.add_argument(
+        "--encoder-size", type=int, help="keep larger frames of this size for the encoder too"
+    )
+    record.add_argument(
+        "--env-kwargs", nargs="*", default=[], metavar="KEY=VALUE", help="e.g. size=128"
+    )
 
     train = commands.add_parser("train", help="learn, evaluate, and write a report")
     train.add_argument("--env", help="id of the environment")
@@ -55,12 +61,24 @@ def default_demo(env: str) -> Path:
     return Path("demos") / f"{env.rpartition('/')[2]}.hdf5"
 
 
-def _record(env: str, path: Path, seed: int, env_kwargs: dict[str, Any] | None = None) -> None:
+def _record(
+    env: str,
+    path: Path,
+    seed: int,
+    env_kwargs: dict[str, Any] | None = None,
+    encoder_frame_size: int | None = None,
+) -> None:
     from regil_sb3.recording import record_expert
 
     if path.exists():
         raise ValueError(f"{path} exists already: choose another file with -o, or remove it")
-    demo = record_expert(env, seed=seed, env_kwargs=env_kwargs)
+    demo = record_expert(
+        env,
+        seed=seed,
+        env_kwargs=env_kwargs,
+        encoder_frame_size=encoder_frame_size,
+        progress=lambda line: print(line, file=sys.stderr),
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     demo.save(path)
     tried = demo.metadata["seeds_tried"]
@@ -74,30 +92,34 @@ def _train(args: argparse.Namespace) -> None:
     from regil_wrappers import Demonstration
 
     from regil_sb3 import training
-    from regil_sb3.settings import make_settings
+    from regil_sb3.settings import encoder_size, make_settings
 
     training.keep_freed_memory()
     training.set_threads()
-    if args.resume is not None:
-        run = args.resume
-        training.resume(run)
-    else:
-        if not args.env:
-            raise ValueError("--env is missing: name an environment, or --resume a run")
-        settings = make_settings(args.env, args.preset, args.seed, args.steps, args.set)
-        run = args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-{args.seed}"
-        if (run / "config.yaml").exists():
-            raise ValueError(
-                f"{run} holds a run already: choose another --out, or go on with --resume {run}"
-            )
-        demo = args.demo or default_demo(args.env)
-        if not demo.exists():
-            _record(args.env, demo, args.seed, settings.env_kwargs)
-        try:
+    if args.resume is None and not args.env:
+        raise ValueError("--env is missing: name an environment, or --resume a run")
+    run = args.resume or args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-{args.seed}"
+    try:
+        if args.resume is not None:
+            training.resume(run)
+        else:
+            settings = make_settings(args.env, args.preset, args.seed, args.steps, args.set)
+            training.refuse_finished(run)
+            demo = args.demo or default_demo(args.env)
+            if not demo.exists():
+                size = encoder_size(settings)
+                try:
+                    _record(args.env, demo, args.seed, settings.env_kwargs, size)
+                except ValueError as error:
+                    raise ValueError(
+                        f"{demo} is not there ({error}): make one with `regil record`, "
+                        "or name yours with --demo"
+                    ) from error
             training.train(settings, Demonstration.load(demo), run)
-        except KeyboardInterrupt:
-            print(f"\nsaved; go on with: regil train --resume {run}")
-            raise
+    except KeyboardInterrupt:
+        if (run / "buffers.npz").exists():
+            print(f"\nsaved; go on with: regil train --resume {run}", file=sys.stderr)
+        raise
     _evaluate(run, args.episodes)
     _report(run, None)
 
@@ -122,9 +144,14 @@ def _report(run: Path, out: Path | None) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run a command; 0 when it worked, 2 for bad input (one line says what), 130 for Ctrl-C."""
     args = _parser().parse_args(argv)
+    from gymnasium.error import Error as GymnasiumError
+
     try:
         if args.command == "record":
-            _record(args.env, args.out or default_demo(args.env), args.seed)
+            from regil_sb3.settings import pairs
+
+            out = args.out or default_demo(args.env)
+            _record(args.env, out, args.seed, pairs(args.env_kwargs), args.encoder_size)
         elif args.command == "train":
             _train(args)
         elif args.command == "evaluate":
@@ -137,7 +164,7 @@ def main(argv: list[str] | None = None) -> int:
             bench.main(args.table)
     except KeyboardInterrupt:
         return 130
-    except (ValueError, OSError, MemoryError, FloatingPointError, ImportError) as error:
+    except (ValueError, OSError, MemoryError, ArithmeticError, ImportError, GymnasiumError) as error:
         print(f"regil: {error}", file=sys.stderr)
         return 2
     return 0

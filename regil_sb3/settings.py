@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
+from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper, make_encoder
 
 from regil_sb3.td3bc import TD3BC
 
@@ -151,11 +151,8 @@ def make_settings(
             setattr(settings, name, section.pop(name))
     settings.hyperparams = section
     settings.hyperparams.pop("demo", None)  # the run folder's own copy is used
-    for override in overrides or []:
-        key, separator, text = override.partition("=")
-        if not separator:
-            raise ValueError(f"--set {override!r}: write KEY=VALUE")
-        _override(settings, key.strip(), yaml.safe_load(text))
+    for key, value in pairs(overrides or []).items():
+        _override(settings, key, value)
     if steps is not None:
         settings.steps = steps
     known = inspect.signature(TD3BC).parameters
@@ -163,6 +160,30 @@ def make_settings(
         if name not in known:
             raise ValueError(f"preset {preset!r}: {name!r} is no argument of TD3BC")
     return settings
+
+
+def pairs(words: list[str]) -> dict[str, Any]:
+    """Read ["KEY=VALUE", ...], each VALUE as plain YAML.
+
+    Raises:
+        ValueError: a word without "=", or no YAML behind it.
+    """
+    out = {}
+    for word in words:
+        key, separator, text = word.partition("=")
+        try:
+            if not separator:
+                raise ValueError
+            out[key.strip()] = yaml.safe_load(text)
+        except (ValueError, yaml.YAMLError):
+            raise ValueError(f"{word!r}: write KEY=VALUE, with VALUE as YAML") from None
+    return out
+
+
+def encoder_size(settings: Settings) -> int | None:
+    """Picture size that the run's encoder wants, or None if the observation's will do."""
+    size: int | None = getattr(make_encoder(settings.retrieval("encoder")), "frame_size", None)
+    return size
 
 
 def _override(settings: Settings, key: str, value: Any) -> None:

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import csv
 import ctypes
 import json
 import os
@@ -40,6 +41,7 @@ from regil_sb3.settings import Settings
 from regil_sb3.td3bc import TD3BC
 
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
+SELECTION_EPISODES = 10  # each time the policy is evaluated during training
 
 
 def keep_freed_memory() -> None:
@@ -100,6 +102,15 @@ class _AppendingCSV(CSVOutputFormat):
             self.file.write(old)
 
 
+def _best_so_far(log: Path) -> float:
+    """The best evaluation of an earlier part of the run, or -1."""
+    if not log.exists():
+        return -1.0
+    with log.open(encoding="utf-8", newline="") as file:
+        rates = [row.get("eval/success_rate") or -1 for row in csv.DictReader(file)]
+    return max(map(float, rates), default=-1.0)
+
+
 class TrainingCallback(BaseCallback):
     """Shows progress, evaluates the policy as it learns, and keeps the models on disk.
 
@@ -113,7 +124,7 @@ class TrainingCallback(BaseCallback):
         self.run = run
         self.eval_env = env
         self.every, self.episodes = every, episodes
-        self.best = -1.0
+        self.best = _best_so_far(run / "progress.csv")
         self._next = every
         self._first = True
         self._repeat = action_repeat(env)
@@ -222,6 +233,18 @@ def _environments(settings: Settings, demo: Path) -> Iterator[tuple[VecEnv, VecE
         env.close()
 
 
+def refuse_finished(run: Path) -> None:
+    """Never write over a run.
+
+    Raises:
+        ValueError: the folder holds one.
+    """
+    if (run / "config.yaml").exists():
+        raise ValueError(
+            f"{run} holds a run already: choose another --out, or go on with --resume {run}"
+        )
+
+
 def train(settings: Settings, demo: Demonstration, run: Path) -> None:
     """Learn, and leave a run folder with config, demonstration, logs and models.
 
@@ -229,10 +252,7 @@ def train(settings: Settings, demo: Demonstration, run: Path) -> None:
         ValueError: the folder holds a run already, or the settings do not fit.
         KeyboardInterrupt: passed on after everything is saved.
     """
-    if (run / "config.yaml").exists():
-        raise ValueError(
-            f"{run} holds a run already: choose another --out, or go on with --resume {run}"
-        )
+    refuse_finished(run)
     run.mkdir(parents=True, exist_ok=True)
     demo.save(run / "demo.hdf5")
     with _environments(settings, run / "demo.hdf5") as (env, eval_env):
@@ -267,10 +287,11 @@ def resume(run: Path) -> Settings:
 
 
 def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> None:
+    every = max(settings.steps // 6, 1)
+    # The callback reads the log before it is reopened
+    callback = TrainingCallback(run, eval_env, every, SELECTION_EPISODES)
     formats = [_AppendingCSV(run / "progress.csv"), TensorBoardOutputFormat(str(run))]
     model.set_logger(Logger(str(run), formats))
-    every = max(settings.steps // 6, 1)
-    callback = TrainingCallback(run, eval_env, every, episodes=10)
     fresh = model.num_timesteps == 0
     try:
         model.learn(settings.steps - model.num_timesteps, callback, reset_num_timesteps=fresh)
@@ -297,13 +318,14 @@ def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int)
     return model
 
 
-def evaluate_run(run: Path, episodes: int, bc_updates: int = BC_UPDATES) -> dict[str, Any]:
+def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
     """Evaluate a run's last model, guided replay and BC, and write ``evaluation.json``.
+
+    BC is trained here when the folder has no ``bc_model.zip`` yet.
 
     Args:
         run: the folder.
         episodes: unseen episodes, the same for each method.
-        bc_updates: of the behaviour cloning on the demonstration alone; its model is kept.
 
     Returns:
         What was written.
@@ -321,7 +343,7 @@ def evaluate_run(run: Path, episodes: int, bc_updates: int = BC_UPDATES) -> dict
         if (run / "bc_model.zip").exists():
             bc = TD3BC.load(run / "bc_model.zip")
         else:
-            bc = train_bc(settings, demo, env, bc_updates)
+            bc = train_bc(settings, demo, env, BC_UPDATES)
             save_model(bc, run / "bc_model.zip")
         results: dict[str, Any] = {
             "steps": model.num_timesteps,

@@ -282,6 +282,17 @@ def test_guided_stretches_are_joined():
     assert report._guided(rows) == [(0, 20), (30, 40)]
 
 
+def test_nested_settings_become_one_table():
+    settings = {"a": {"b": {"c": 1}, "empty": {}}, "wrap": [{"x": {"k": 5}}, "y"], "flat": [1, 2]}
+    assert report._flat(settings) == [
+        ("a.b.c", 1),
+        ("a.empty", {}),
+        ("wrap.0.x.k", 5),
+        ("wrap.1", "y"),
+        ("flat", [1, 2]),
+    ]
+
+
 def test_wilson_interval_is_the_published_one():
     # Newcombe (1998), Table I, score method without continuity correction: 15/148 and 0/20.
     assert report._wilson(15, 148) == pytest.approx((6.24, 16.05), abs=0.1)

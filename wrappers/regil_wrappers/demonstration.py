@@ -74,7 +74,7 @@ _METADATA_DEFAULTS: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Demonstration:
     """One demonstration of a task.
 
@@ -150,6 +150,10 @@ class Demonstration:
             if successes[0]:
                 raise ValueError("successes[0] is True: the task is solved before it begins")
             put("successes", successes)
+
+    def __repr__(self) -> str:
+        actions = "no" if self.actions is None else len(self.actions)
+        return f"<Demonstration: {len(self)} frames {self.frames.shape[1:]}, {actions} actions>"
 
     def __len__(self) -> int:
         """The number of frames."""

@@ -14,6 +14,7 @@ import os
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -327,9 +328,10 @@ def _cache_folder() -> Path:
 
 def _read_cached(file: Path, frames: int) -> NDArray[np.float32] | None:
     try:
-        with np.load(file, allow_pickle=False) as archive:
+        # Opened here: np.load leaves a file open that it cannot read.
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             embeddings = archive["embeddings"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None  # not there, or not readable: it is only a cache, and is written again
     if embeddings.dtype != np.float32 or embeddings.ndim != 2 or len(embeddings) != frames:
         return None
@@ -346,5 +348,6 @@ def _write_cached(file: Path, embeddings: NDArray[np.float32]) -> None:
         with temporary.open("wb") as stream:
             np.savez(stream, embeddings=embeddings)
         temporary.replace(file)
-    except OSError:
-        temporary.unlink(missing_ok=True)  # a full or read-only cache costs time, nothing else
+    except OSError:  # a full or read-only cache costs time, nothing else
+        with suppress(OSError):
+            temporary.unlink()

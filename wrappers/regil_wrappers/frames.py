@@ -119,9 +119,8 @@ class FrameSource:
         if self._channels_first:
             frame = np.moveaxis(frame, 0, -1)
         if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3:
-            raise ValueError(
-                f"the environment's picture is not a uint8 array (H, W, 3): {frame!r:.60}"
-            )
+            got = f"{getattr(frame, 'dtype', type(frame).__name__)} {np.shape(frame)}"
+            raise ValueError(f"the environment's picture is {got}: it must be uint8 (H, W, 3)")
         if not self._first_is_checked:
             check_size(frame.shape[:2], recorded.shape[:2], self._label)
             check_upright(frame, recorded, self._label)

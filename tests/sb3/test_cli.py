@@ -1,0 +1,218 @@
+"""The command line on a real environment, with step counts that a test can pay for."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import yaml
+from regil_wrappers import Demonstration
+
+from regil_sb3 import TD3BC, training
+from regil_sb3.cli import main
+from regil_sb3.settings import Settings, make_settings, presets
+from regil_sb3.training import TrainingCallback, make_env, save_model
+
+ENV = "regil/metaworld-button-press-v0"
+TINY = ["--set", "warmup_steps=150", "--set", "learning_starts=100", "--set", "bc_pretrain_steps=3",
+        "--set", "batch_size=8", "--set", "buffer_size=500", "--episodes", "2"]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(training, "BC_UPDATES", 5)
+    monkeypatch.setattr(training, "SELECTION_EPISODES", 1)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    path = tmp_path_factory.mktemp("demos") / "demo.hdf5"
+    assert main(["record", ENV, "-o", str(path), "--seed", "3"]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(demo, tmp_path_factory):
+    """One finished run; tests read it."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "BC_UPDATES", 5)
+        patch.setattr(training, "SELECTION_EPISODES", 1)
+        words = ["train", "--env", ENV, "--demo", str(demo), "--out", str(folder), "--steps", "260"]
+        assert main([*words, *TINY]) == 0
+    return folder
+
+
+def rows(folder):
+    with (folder / "progress.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_run_folder_holds_what_the_contract_names(run):
+    for name in ("config.yaml", "demo.hdf5", "model.zip", "best_model.zip", "progress.csv",
+                 "report.html", "evaluation.json", "episode.hdf5"):  # fmt: skip
+        assert (run / name).stat().st_size > 0, name
+    assert list(run.glob("events.out.tfevents.*"))
+    results = json.loads((run / "evaluation.json").read_text())
+    assert results["steps"] == 260
+    assert results["frames"] == 520
+    assert results["seeds"] == [1_000_000, 1_000_001]
+    for method in ("policy", "guide", "bc"):
+        assert results[method]["episodes"] == 2
+        assert results[method]["success"] == np.mean(results[method]["successes"])
+    assert any(row.get("eval/success_rate") for row in rows(run))
+    assert max(float(row["time/frames"]) for row in rows(run) if row["time/frames"]) <= 520
+    assert len(Demonstration.load(run / "episode.hdf5")) == results["policy"]["lengths"][0] + 1
+
+
+def test_config_makes_the_run_again(run):
+    settings = Settings.load(run / "config.yaml")
+    again = make_settings(ENV, None, 0, 260, TINY[1:10:2])
+    assert settings == again
+
+
+def test_evaluate_and_report_again(run, capsys):
+    before = json.loads((run / "evaluation.json").read_text())
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 0
+    after = json.loads((run / "evaluation.json").read_text())
+    for method in ("policy", "guide", "bc"):  # the same seeds give the same episodes
+        assert after[method]["returns"] == pytest.approx(before[method]["returns"][:1])
+    assert "guided replay" in capsys.readouterr().out
+    assert main(["report", str(run)]) == 0
+
+
+def test_a_run_is_never_written_over(run, demo, capsys):
+    assert main(["train", "--env", ENV, "--demo", str(demo), "--out", str(run)]) == 2
+    assert "holds a run already" in capsys.readouterr().err
+
+
+def test_interrupted_run_saves_and_goes_on(demo, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "run"
+    step = TrainingCallback._on_step
+
+    def interrupt(self):
+        if self.num_timesteps == 170:
+            raise KeyboardInterrupt
+        return step(self)
+
+    monkeypatch.setattr(TrainingCallback, "_on_step", interrupt)
+    words = ["train", "--env", ENV, "--demo", str(demo), "--out", str(folder), "--steps", "220"]
+    assert main([*words, *TINY]) == 130
+    assert f"regil train --resume {folder}" in capsys.readouterr().err
+    kept = len(rows(folder))
+    monkeypatch.setattr(TrainingCallback, "_on_step", step)
+    assert main(["train", "--resume", str(folder), "--episodes", "1"]) == 0
+    assert TD3BC.load(folder / "model.zip").num_timesteps == 220
+    assert len(rows(folder)) > kept
+    assert not (folder / "buffers.npz").exists()
+    assert main(["train", "--resume", str(folder)]) == 2
+
+
+def test_failed_save_loses_nothing(run, tmp_path, monkeypatch):
+    path = tmp_path / "model.zip"
+    model = TD3BC.load(run / "model.zip")
+    save_model(model, path)
+    good = path.read_bytes()
+
+    def break_off(self, file):
+        file.write(b"half")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(TD3BC, "save", break_off)
+    with pytest.raises(OSError, match="No space"):
+        save_model(model, path)
+    assert path.read_bytes() == good
+
+
+def test_nan_stops_training_and_keeps_the_model(demo, tmp_path, monkeypatch, capsys):
+    sample = TD3BC._store_transition
+
+    def poison(self, buffer, action, obs, reward, dones, infos):
+        if self.num_timesteps == 230:
+            reward = reward * np.nan
+        return sample(self, buffer, action, obs, reward, dones, infos)
+
+    monkeypatch.setattr(TD3BC, "_store_transition", poison)
+    words = ["train", "--env", ENV, "--demo", str(demo), "--out", str(tmp_path / "run")]
+    assert main([*words, "--steps", "260", *TINY]) == 2
+    assert "not finite at step 230" in capsys.readouterr().err
+    assert TD3BC.load(tmp_path / "run" / "model.zip").num_timesteps < 230
+
+
+def test_evaluation_seeds_give_the_same_frames_to_every_method(demo):
+    env = make_env(make_settings(ENV), demo, n_envs=1)
+    first = []
+    for _ in range(2):
+        env.seed(1_000_003)
+        first.append(env.reset())
+        env.step(np.ones((1, 4), np.float32))
+    env.close()
+    assert np.array_equal(*first)
+    assert first[0].shape == (1, 84, 84, 6)
+
+
+def test_presets_are_plain_yaml_and_fit():
+    sections = presets()
+    assert {"default", "quick", "paper"} <= sections.keys()
+    assert sum(name.startswith("regil/metaworld-") for name in sections) == 7
+    for name, section in sections.items():
+        settings = make_settings(ENV, name)
+        assert settings.steps == section["n_timesteps"]
+        assert len(settings.wrappers("demo.hdf5")) == 2
+        if name.startswith("regil/"):
+            demos = {next(iter(w.values()))["demo"] for w in section["env_wrapper"]}
+            assert demos == {section["demo"]} == {f"demos/{name.removeprefix('regil/')}.hdf5"}
+
+
+@pytest.mark.parametrize(
+    ("override", "where", "value"),
+    [
+        ("bc_coef=0.5", lambda s: s.hyperparams["bc_coef"], 0.5),
+        ("k=9", lambda s: s.retrieval("k"), 9),
+        ("frame_stack=3", lambda s: s.frame_stack, 3),
+        ("env_kwargs.camera=corner2", lambda s: s.env_kwargs, {"camera": "corner2"}),
+        ("guide_patience=8", lambda s: s.wrappers("d")[0][1]["guide_patience"], 8),
+        ("policy_kwargs.shared_encoder=false", lambda s: s.hyperparams["policy_kwargs"],
+         {"shared_encoder": False}),
+    ],
+)  # fmt: skip
+def test_overrides(override, where, value):
+    settings = make_settings(ENV, overrides=[override])
+    assert where(settings) == value
+    yaml.safe_dump(settings.hyperparams)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["train"], "--env is missing"),
+        (["train", "--env", ENV, "--preset", "fast"], "preset 'fast' is unknown: use one of default"),
+        (["train", "--env", ENV, "--set", "bc_coeff=1"], "did you mean bc_coef"),
+        (["train", "--env", ENV, "--set", "bc_coef"], "write KEY=VALUE"),
+        (["train", "--env", ENV, "--set", "encoder=vgg"], "pixels"),
+        (["train", "--env", "regil/metaworld-fly-v0"], "metaworld-fly"),
+        (["train", "--resume", "nowhere"], "nowhere is not a run folder"),
+        (["evaluate", "nowhere"], "nowhere is not a run folder"),
+        (["report", "nowhere"], "nowhere"),
+        (["record", "Pendulum-v1"], "no scripted expert"),
+        (["bench", "nothing"], "nothing"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.strip().splitlines()) == 1, error
+    assert not list(tmp_path.rglob("*.hdf5"))
+
+
+def test_missing_demonstration_names_what_to_do(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "--env", "Pendulum-v1"]) == 2
+    error = capsys.readouterr().err
+    assert "no scripted expert" in error
+    assert "`regil record`" in error
+    assert "--demo" in error

@@ -1,0 +1,53 @@
+"""The wheel stands alone: these tests pass in an environment that has no torch and no SB3."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).resolve().parent
+PROJECT = HERE.parents[1] / "wrappers"
+
+
+@pytest.mark.packaging
+@pytest.mark.skipif(not (PROJECT / "setup.cfg").is_file(), reason="runs in the repository only")
+def test_the_wheel_alone(tmp_path: Path) -> None:
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "PYTEST"))}
+
+    def run(*command: str | Path) -> str:
+        done = subprocess.run(
+            [str(part) for part in command],
+            cwd=tmp_path,
+            env=clean,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout
+        return done.stdout
+
+    run(sys.executable, "-m", "venv", tmp_path / "venv")
+    python = tmp_path / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    run(python, "-m", "pip", "wheel", "-q", "--no-deps", "-w", tmp_path, PROJECT)
+    (wheel,) = tmp_path.glob("regil_wrappers-*.whl")
+    inside = zipfile.ZipFile(wheel).namelist()
+    assert {name.split("/")[0].split("-")[0] for name in inside} == {"regil_wrappers"}
+    assert "regil_wrappers/py.typed" in inside
+    assert any(name.endswith("LICENSE") for name in inside)
+
+    run(python, "-m", "pip", "install", "-q", f"{wheel}[tests]")
+    for absent in ("torch", "stable_baselines3", "timm"):
+        code = f"import importlib.util as u, sys; sys.exit(u.find_spec({absent!r}) is not None)"
+        run(python, "-c", code)
+    report = run(
+        *(python, "-m", "pytest", "-q", "-W", "error", "-m", "not packaging"),
+        *("-o", "markers=packaging: builds a wheel", "-p", "no:cacheprovider", HERE),
+    )
+    assert " passed" in report
+    assert "failed" not in report
