@@ -164,7 +164,14 @@ def main(argv: list[str] | None = None) -> int:
             bench.main(args.table)
     except KeyboardInterrupt:
         return 130
-    except (ValueError, OSError, MemoryError, ArithmeticError, ImportError, GymnasiumError) as error:
+    except (
+        ValueError,
+        OSError,
+        MemoryError,
+        ArithmeticError,
+        ImportError,
+        GymnasiumError,
+    ) as error:
         print(f"regil: {error}", file=sys.stderr)
         return 2
     return 0

@@ -33,7 +33,7 @@ class Evaluation:
     first_actions: list[npt.NDArray[np.float32]] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """For ``evaluation.json``; returns are sums of the reward that the policy was trained on."""
+        """For ``evaluation.json``; returns are sums of the reward trained on."""
         return {
             "success": float(np.mean(self.successes)),
             "episodes": len(self.successes),
@@ -86,7 +86,9 @@ def evaluate(
         ValueError: more than one environment, or no episode.
     """
     if env.num_envs != 1 or episodes < 1:
-        raise ValueError(f"evaluation needs one environment and an episode, not {env.num_envs} and {episodes}")
+        raise ValueError(
+            f"evaluation needs one environment and an episode, not {env.num_envs} and {episodes}"
+        )
     result = Evaluation()
     for episode in range(episodes):
         env.seed(first_seed + episode)

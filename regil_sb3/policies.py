@@ -3,7 +3,7 @@
 - ``ConvEncoder``: the small convolutional network that is the default.
 - ``ResNet18Encoder``: ResNet-18 with group normalisation, by name, for the paper preset.
 - ``random_shift``: the augmentation of DrQ (https://arxiv.org/abs/2004.13649).
-- ``ImagePolicy``: TD3's policy on images, with one encoder each for actor and critic, or one shared.
+- ``ImagePolicy``: TD3's policy on images, one encoder for actor and critic each, or shared.
 """
 
 from __future__ import annotations

@@ -28,8 +28,8 @@ class FrameReplayBuffer(BaseBuffer):
     """Replay buffer that stores each frame once and serves n-step returns.
 
     Its content, and what ``sample`` draws after equal seeds, is that of SB3's ``NStepReplayBuffer``
-    (``ReplayBuffer`` for ``n_steps=1``), at 1 / (2 n_stack) of the memory. Frames must be stacked by
-    SB3's ``VecFrameStack`` (newest frame last on the channel axis, zeros before the episode).
+    (``ReplayBuffer`` for ``n_steps=1``), at 1 / (2 n_stack) of the memory. Frames must be stacked
+    by SB3's ``VecFrameStack`` (newest frame last on the channel axis, zeros before the episode).
 
     Args:
         buffer_size: transitions, all environments together.
@@ -65,7 +65,9 @@ class FrameReplayBuffer(BaseBuffer):
         super().__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
         assert isinstance(observation_space, spaces.Box)
         if optimize_memory_usage:
-            raise ValueError("FrameReplayBuffer never stores a frame twice: leave out optimize_memory_usage")
+            raise ValueError(
+                "FrameReplayBuffer never stores a frame twice: leave out optimize_memory_usage"
+            )
         if observation_space.shape[0] % n_stack:
             raise ValueError(
                 f"observations of shape {observation_space.shape} do not divide into "
@@ -150,13 +152,19 @@ class FrameReplayBuffer(BaseBuffer):
         self.full = self.total >= self.buffer_size
 
     def _stack(
-        self, newest: npt.NDArray[Any], time: npt.NDArray[Any], age: npt.NDArray[Any], env: npt.NDArray[Any]
+        self,
+        newest: npt.NDArray[Any],
+        time: npt.NDArray[Any],
+        age: npt.NDArray[Any],
+        env: npt.NDArray[Any],
     ) -> npt.NDArray[Any]:
         """Stack ``newest`` (B, C, H, W) on the frames before ``time``; zeros before the episode."""
         if self.n_stack == 1:
             return newest
         channels = self.frame_shape[0]
-        stacked = np.empty((len(newest), self.n_stack * channels, *self.frame_shape[1:]), newest.dtype)
+        stacked = np.empty(
+            (len(newest), self.n_stack * channels, *self.frame_shape[1:]), newest.dtype
+        )
         stacked[:, -channels:] = newest
         for back in range(1, self.n_stack):
             stop = (self.n_stack - back) * channels
@@ -231,7 +239,9 @@ class FrameReplayBuffer(BaseBuffer):
         """
         total = int(state["total"])
         frames = state["frames"]
-        if frames.shape[1:] != self.frames.shape[1:] or len(frames) != min(total + 1, self.n_frames):
+        if frames.shape[1:] != self.frames.shape[1:] or len(frames) != min(
+            total + 1, self.n_frames
+        ):
             raise ValueError(
                 f"a saved replay buffer of frames {frames.shape} does not fit one of "
                 f"{self.frames.shape}: use the same buffer_size, environments and image size"

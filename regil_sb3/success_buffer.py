@@ -142,7 +142,9 @@ class SuccessBuffer:
             observations: Observations = (
                 state[prefix]
                 if prefix in state
-                else {k[len(prefix) + 1 :]: v for k, v in state.items() if k.startswith(prefix + "/")}
+                else {
+                    k[len(prefix) + 1 :]: v for k, v in state.items() if k.startswith(prefix + "/")
+                }
             )
             self._episodes.append(_Episode(observations, state[f"{i}/actions"]))
         self._ends = np.cumsum([len(e) for e in (*self._pinned, *self._episodes)])

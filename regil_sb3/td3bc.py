@@ -16,11 +16,16 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    Schedule,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
 from stable_baselines3.common.utils import polyak_update, safe_mean
 from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
-from stable_baselines3.td3.policies import Actor, MlpPolicy, MultiInputPolicy, TD3Policy
-from torch import nn
+from stable_baselines3.td3.policies import MlpPolicy, MultiInputPolicy, TD3Policy
 from torch.nn import functional as F  # noqa: N812
 
 from regil_sb3.policies import ImagePolicy
@@ -241,11 +246,14 @@ class TD3BC(TD3):
         if self.demo is None:
             raise ValueError(f"bc_coef={self.bc_coef} needs demo=: give its file, or set bc_coef=0")
         if self.demo.actions is None:
-            raise ValueError("the demonstration has no actions, which the BC term needs: set bc_coef=0")
+            raise ValueError(
+                "the demonstration has no actions, which the BC term needs: set bc_coef=0"
+            )
 
     def _add_demonstration(self, demo: Demonstration) -> None:
         """Put the demonstration into the success buffer as the policy would have seen it."""
-        assert demo.actions is not None and isinstance(self.action_space, spaces.Box)
+        assert demo.actions is not None
+        assert isinstance(self.action_space, spaces.Box)
         n = len(demo.actions)
         if demo.actions.shape[1:] != self.action_space.shape:
             raise ValueError(
@@ -282,12 +290,16 @@ class TD3BC(TD3):
 
     def _check_observations(self, observations: Observations) -> None:
         space = self.observation_space
-        got: Any = {k: v.shape[1:] for k, v in observations.items()} if isinstance(
-            observations, dict
-        ) else observations.shape[1:]
-        want: Any = {k: s.shape for k, s in space.items()} if isinstance(
-            space, spaces.Dict
-        ) else space.shape
+        got: Any = (
+            {k: v.shape[1:] for k, v in observations.items()}
+            if isinstance(observations, dict)
+            else observations.shape[1:]
+        )
+        want: Any = (
+            {k: s.shape for k, s in space.items()}
+            if isinstance(space, spaces.Dict)
+            else space.shape
+        )
         if got != want:
             raise ValueError(
                 f"the demonstration's observations have shape {got} but the policy sees {want}"
@@ -344,7 +356,8 @@ class TD3BC(TD3):
         action_noise: ActionNoise | None = None,
         n_envs: int = 1,
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-        assert isinstance(self.action_space, spaces.Box) and self.env is not None
+        assert isinstance(self.action_space, spaces.Box)
+        assert self.env is not None
         if self._guided.all():
             action = np.zeros((n_envs, *self.action_space.shape), np.float32)
             buffer_action = action.copy()
@@ -458,7 +471,11 @@ class TD3BC(TD3):
         return loss if self.bc_loss == "mse" else loss / (2.0 * self.bc_std**2)
 
     def _augmented(self, observations: Any) -> Any:
-        return self.policy.augment(observations) if isinstance(self.policy, ImagePolicy) else observations
+        return (
+            self.policy.augment(observations)
+            if isinstance(self.policy, ImagePolicy)
+            else observations
+        )
 
     def pretrain_bc(self, steps: int, progress: Callable[[int], None] | None = None) -> None:
         """Train the actor by the BC term alone, then set its target to it.
@@ -483,8 +500,8 @@ class TD3BC(TD3):
     def _require_finite(self, name: str, value: float) -> None:
         if not np.isfinite(value):
             raise FloatingPointError(
-                f"{name} is {value} at step {self.num_timesteps}, update {self._n_updates}: training "
-                "stopped, the model saved last is untouched; a lower learning_rate or reward_scale "
+                f"{name} is {value} at step {self.num_timesteps}, update {self._n_updates}: "
+                "training stopped, the model saved last is untouched; a lower learning_rate or reward_scale "
                 f"(now {self.used_reward_scale:g}) may help"
             )
 
@@ -492,10 +509,10 @@ class TD3BC(TD3):
         """Turn updates per transition (a float) into whole updates, keeping the remainder."""
         if not isinstance(gradient_steps, float):
             return gradient_steps
-        assert not isinstance(self.train_freq, int)
-        if self.train_freq.unit != TrainFrequencyUnit.STEP:  # type: ignore[union-attr]
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.train_freq.unit != TrainFrequencyUnit.STEP:
             raise ValueError("a fractional gradient_steps needs a train_freq counted in steps")
-        self._updates_due += gradient_steps * self.train_freq.frequency * self.n_envs  # type: ignore[union-attr]
+        self._updates_due += gradient_steps * self.train_freq.frequency * self.n_envs
         whole = int(self._updates_due)
         self._updates_due -= whole
         return whole
@@ -519,7 +536,9 @@ class TD3BC(TD3):
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
             observations = self._augmented(replay_data.observations)
             next_observations = self._augmented(replay_data.next_observations)
-            dones = th.zeros_like(replay_data.dones) if self.bootstrap_success else replay_data.dones
+            dones = (
+                th.zeros_like(replay_data.dones) if self.bootstrap_success else replay_data.dones
+            )
 
             with th.no_grad():
                 # Target: smoothed target action, min of the target critics
@@ -580,7 +599,9 @@ class TD3BC(TD3):
                 own = self.actor.mu if shared else self.actor
                 own_target = self.actor_target.mu if shared else self.actor_target
                 polyak_update(own.parameters(), own_target.parameters(), self.tau)
-                polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
+                polyak_update(
+                    self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0
+                )
                 polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -37,7 +37,9 @@ from regil_sb3.evaluation import (
     guide_act,
     policy_act,
 )
+from regil_sb3.replay_buffer import FrameReplayBuffer
 from regil_sb3.settings import Settings
+from regil_sb3.success_buffer import SuccessBuffer
 from regil_sb3.td3bc import TD3BC
 
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
@@ -202,9 +204,11 @@ def save_model(model: TD3BC, path: Path) -> None:
 
 def _save_buffers(model: TD3BC, path: Path) -> None:
     buffers = {"success": model.success_buffer.state()}
-    if hasattr(model.replay_buffer, "state"):
+    if isinstance(model.replay_buffer, FrameReplayBuffer):
         buffers["replay"] = model.replay_buffer.state()
-    arrays = {f"{name}/{k}": v for name, state in buffers.items() for k, v in state.items()}
+    arrays: dict[str, Any] = {
+        f"{name}/{k}": v for name, state in buffers.items() for k, v in state.items()
+    }
     temporary = path.with_name(f".{path.name}")
     with temporary.open("wb") as file:
         np.savez(file, **arrays)
@@ -217,7 +221,8 @@ def _load_buffers(model: TD3BC, path: Path) -> None:
             prefix = f"{name}/"
             state = {k.removeprefix(prefix): arrays[k] for k in arrays if k.startswith(prefix)}
             if state:
-                buffer.load_state(state)  # type: ignore[union-attr]
+                assert isinstance(buffer, SuccessBuffer | FrameReplayBuffer)
+                buffer.load_state(state)
 
 
 @contextmanager
@@ -276,7 +281,7 @@ def resume(run: Path) -> Settings:
     settings = Settings.load(run / "config.yaml")
     if not (run / "buffers.npz").exists():
         raise ValueError(
-            f"{run} was not interrupted by Ctrl-C, so its replay buffer is not there to go on with: "
+            f"{run} was not interrupted by Ctrl-C, so it has no replay buffer to go on with: "
             "start a new run, or use `regil evaluate` on this one"
         )
     with _environments(settings, run / "demo.hdf5") as (env, eval_env):
@@ -314,7 +319,11 @@ def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int)
     model = TD3BC(settings.policy, env, demo=demo, seed=settings.seed, **hyperparams)
     model.set_logger(Logger(None, []))
     with tqdm(total=updates, desc="behaviour cloning", unit="update", dynamic_ncols=True) as bar:
-        model.pretrain_bc(updates, progress=lambda done: bar.update(1) and None)
+
+        def show(_: int) -> None:
+            bar.update(1)
+
+        model.pretrain_bc(updates, show)
     return model
 
 

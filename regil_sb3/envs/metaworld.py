@@ -6,14 +6,12 @@
 
 from __future__ import annotations
 
-import atexit
 import difflib
 import functools
 import importlib
 import os
 import sys
 import warnings
-import weakref
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -46,10 +44,8 @@ class _Renderer:
     """Draws one camera of one model, off screen, in any square size.
 
     MuJoCo's own `Renderer` draws in one size only, copies each picture twice, and has an OpenGL
-    context of its own, which leaves it to chance whose pictures a garbage collection frees.
+    context of its own: with several, it is chance whose pictures a garbage collection frees.
     """
-
-    _live: ClassVar[weakref.WeakSet[_Renderer]] = weakref.WeakSet()
 
     def __init__(self, model: Any, camera: int, size: int) -> None:
         import mujoco  # type: ignore[import-untyped]
@@ -69,7 +65,6 @@ class _Renderer:
         self._perturbation = mujoco.MjvPerturb()
         model.vis.global_.offwidth = model.vis.global_.offheight = self._size = size
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
-        self._live.add(self)
 
     def draw(self, data: Any, size: int) -> Frame:
         """Draw the scene: (size, size, 3) uint8, in OpenGL's order (bottom row first)."""
@@ -96,12 +91,8 @@ class _Renderer:
 
     def close(self) -> None:
         """Free what the graphics library holds; nothing can be drawn afterwards."""
-        if self in self._live:
-            self._live.discard(self)
-            self._gl.make_current()
-            self._context.free()
-
-    __del__ = close
+        self._gl.make_current()
+        self._context.free()
 
 
 @functools.cache
@@ -112,16 +103,7 @@ def _gl_context() -> Any:
         module = importlib.import_module(f"mujoco.{backend}")
     except ModuleNotFoundError:
         raise ValueError(f"MUJOCO_GL={backend!r} must be one of egl, glfw, osmesa") from None
-    context = module.GLContext(64, 64)
-
-    # Registered last, hence run first: before the library closes the display and Python the modules
-    @atexit.register
-    def free() -> None:
-        for renderer in list(_Renderer._live):
-            renderer.close()
-        context.free()
-
-    return context
+    return module.GLContext(64, 64)
 
 
 def _prepare_graphics() -> None:

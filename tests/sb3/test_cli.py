@@ -188,7 +188,10 @@ def test_overrides(override, where, value):
     ("words", "message"),
     [
         (["train"], "--env is missing"),
-        (["train", "--env", ENV, "--preset", "fast"], "preset 'fast' is unknown: use one of default"),
+        (
+            ["train", "--env", ENV, "--preset", "fast"],
+            "preset 'fast' is unknown: use one of default",
+        ),
         (["train", "--env", ENV, "--set", "bc_coeff=1"], "did you mean bc_coef"),
         (["train", "--env", ENV, "--set", "bc_coef"], "write KEY=VALUE"),
         (["train", "--env", ENV, "--set", "encoder=vgg"], "pixels"),

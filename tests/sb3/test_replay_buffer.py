@@ -29,7 +29,9 @@ class Stream:
         return self.rng.integers(0, 256, (3, SIZE, SIZE), dtype=np.uint8)
 
     def first(self):
-        return np.concatenate([np.zeros((3 * (self.n_stack - 1), SIZE, SIZE), np.uint8), self.frame()])
+        return np.concatenate(
+            [np.zeros((3 * (self.n_stack - 1), SIZE, SIZE), np.uint8), self.frame()]
+        )
 
     def step(self):
         obs = np.stack(self.stacks)

@@ -7,9 +7,10 @@ from regil_sb3.success_buffer import SuccessBuffer, stack_frames
 
 
 def episode(length, value, n_stack=1):
-    frames = np.full((length, 3, 6, 6), value, np.uint8) + np.arange(length, dtype=np.uint8)[
-        :, None, None, None
-    ]
+    frames = (
+        np.full((length, 3, 6, 6), value, np.uint8)
+        + np.arange(length, dtype=np.uint8)[:, None, None, None]
+    )
     return stack_frames(frames, n_stack), np.full((length, 2), value / 100, np.float32)
 
 

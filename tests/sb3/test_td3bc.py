@@ -35,7 +35,7 @@ TD3_OWN = {
 }
 
 
-def small(env, **kwargs):
+def small(env, policy="CnnPolicy", **kwargs):
     settings = {
         "demo": demonstration(),
         "buffer_size": 2_000,
@@ -46,7 +46,7 @@ def small(env, **kwargs):
         "seed": 0,
         "device": "cpu",
     }
-    return TD3BC("CnnPolicy", env, **{**settings, **kwargs})
+    return TD3BC(policy, env, **{**settings, **kwargs})
 
 
 def test_is_td3_to_the_last_bit_when_switched_off():
@@ -118,7 +118,12 @@ def test_demonstration_is_stacked_as_the_policy_sees_it():
 
 @pytest.mark.parametrize(
     ("coef", "floor", "steps", "at", "expected"),
-    [(2.0, 0.1, None, 0, 2.0), (2.0, 0.1, None, 50, 1.0), (2.0, 0.1, None, 100, 0.2), (3.0, 0.0, 40, 40, 0.0)],
+    [
+        (2.0, 0.1, None, 0, 2.0),
+        (2.0, 0.1, None, 50, 1.0),
+        (2.0, 0.1, None, 100, 0.2),
+        (3.0, 0.0, 40, 40, 0.0),
+    ],
 )
 def test_lambda(coef, floor, steps, at, expected):
     model = small(stacked(), bc_coef=coef, bc_floor=floor, bc_steps=steps)
@@ -165,7 +170,9 @@ def test_ablations_are_settings(kwargs, name):
     model = small(stacked(), **kwargs)
     before = [p.clone() for p in model.actor.parameters()]
     model.learn(100)
-    assert any(not th.equal(a, b) for a, b in zip(before, model.actor.parameters(), strict=True)), name
+    assert any(not th.equal(a, b) for a, b in zip(before, model.actor.parameters(), strict=True)), (
+        name
+    )
 
 
 @pytest.mark.parametrize("n_envs", [1, 2, 8])
@@ -246,8 +253,7 @@ def test_subprocesses_and_dict_observations():
         observations={"x": np.linspace(0, 1, len(demo))[:, None].astype(np.float32)},
     )
     env = DummyVecEnv([lambda: Reach(dict_obs=True)])
-    model = TD3BC("MultiInputPolicy", env, demo=with_x, n_steps=1, warmup_steps=40, learning_starts=10,
-                  batch_size=8, buffer_size=500, device="cpu")  # fmt: skip
+    model = small(env, policy="MultiInputPolicy", demo=with_x, n_steps=1)
     model.learn(80)
     assert model.success_buffer.episodes > 1
 
@@ -275,7 +281,7 @@ def test_bad_combinations():
     with pytest.raises(ValueError, match="has no actions"):
         small(stacked(), demo=Demonstration(frames=demo.frames))
     small_frames = Demonstration(frames=demo.frames[:, :36, :36], actions=demo.actions)
-    with pytest.raises(ValueError, match="36x36 frames .* policy sees 40x40"):
+    with pytest.raises(ValueError, match=r"36x36 frames .* policy sees 40x40"):
         small(stacked(), demo=small_frames)
     with pytest.raises(ValueError, match="n_steps=3 with dict observations"):
         TD3BC("MultiInputPolicy", DummyVecEnv([lambda: Reach(dict_obs=True)]), demo=demo)

@@ -39,7 +39,9 @@ class Reach(gym.Env):
         return self._obs(), {}
 
     def guide_action(self):
-        return np.array([self.np_random.uniform(0.5, 0.9), 0.1], np.float32) * self.action_space.high
+        return (
+            np.array([self.np_random.uniform(0.5, 0.9), 0.1], np.float32) * self.action_space.high
+        )
 
     def step(self, action):
         self.executed.append(np.array(action))

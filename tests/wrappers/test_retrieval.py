@@ -41,7 +41,7 @@ class Levels:
         return (frames[:, 0, 0, :1] // 30).astype(np.float32)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(levels, levels, st.integers(1, 5), st.integers(0, 4))
 def test_each_step_is_the_definition(
     demo: list[int], episode: list[int], k: int, horizon: int
@@ -59,7 +59,7 @@ def test_each_step_is_the_definition(
         assert retriever.path()[-1] == (got.window - 1, got.end)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(levels, st.integers(1, 5), st.integers(0, 4), st.sampled_from(["pixels", "noise"]))
 def test_an_exact_replay_costs_nothing(demo: list[int], k: int, horizon: int, kind: str) -> None:
     frames = pictures(demo)
@@ -73,7 +73,7 @@ def test_an_exact_replay_costs_nothing(demo: list[int], k: int, horizon: int, ki
         assert sdtw_reward(alignment) == 0
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(levels, levels, levels)
 def test_reward_is_not_positive_and_does_not_know_the_future(
     demo: list[int], before: list[int], after: list[int]

@@ -10,7 +10,7 @@ import pytest
 import toy_env
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
-from regil_wrappers import Demonstration, Retriever, RetrievalGuideWrapper, RetrievalRewardWrapper
+from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper, Retriever
 from regil_wrappers.rewards import demonstration_tau
 from toy_env import ToyReach
 
