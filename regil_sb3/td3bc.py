@@ -501,8 +501,8 @@ class TD3BC(TD3):
         if not np.isfinite(value):
             raise FloatingPointError(
                 f"{name} is {value} at step {self.num_timesteps}, update {self._n_updates}: "
-                "training stopped, the model saved last is untouched; a lower learning_rate or reward_scale "
-                f"(now {self.used_reward_scale:g}) may help"
+                "training stopped, the model saved last is untouched; a lower learning_rate or "
+                f"reward_scale (now {self.used_reward_scale:g}) may help"
             )
 
     def _number_of_updates(self, gradient_steps: int | float) -> int:

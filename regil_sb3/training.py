@@ -129,13 +129,14 @@ class TrainingCallback(BaseCallback):
         self.best = _best_so_far(run / "progress.csv")
         self._next = every
         self._first = True
+        self._bar = tqdm(unit="step", dynamic_ncols=True)
         self._repeat = action_repeat(env)
 
     def _on_training_start(self) -> None:
         self._next = (self.num_timesteps // self.every + 1) * self.every
         self._first = not self._td3bc.pretrained
-        total = self._td3bc._total_timesteps
-        self._bar = tqdm(total=total, initial=self.num_timesteps, unit="step", dynamic_ncols=True)
+        self._bar.reset(self._td3bc._total_timesteps)
+        self._bar.initial = self._bar.n = self.num_timesteps
 
     @property
     def _td3bc(self) -> TD3BC:
@@ -301,16 +302,15 @@ def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> Non
     try:
         model.learn(settings.steps - model.num_timesteps, callback, reset_num_timesteps=fresh)
     except KeyboardInterrupt:
-        callback.close()
         save_model(model, run / "model.zip")
         _save_buffers(model, run / "buffers.npz")
         raise
-    except FloatingPointError:
+    else:
+        save_model(model, run / "model.zip")
+        (run / "buffers.npz").unlink(missing_ok=True)
+    finally:
         callback.close()
-        raise
-    save_model(model, run / "model.zip")
-    (run / "buffers.npz").unlink(missing_ok=True)
-    model.logger.close()
+        model.logger.close()
 
 
 def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int) -> TD3BC:

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import atexit
 import difflib
 import functools
 import importlib
@@ -103,7 +104,10 @@ def _gl_context() -> Any:
         module = importlib.import_module(f"mujoco.{backend}")
     except ModuleNotFoundError:
         raise ValueError(f"MUJOCO_GL={backend!r} must be one of egl, glfw, osmesa") from None
-    return module.GLContext(64, 64)
+    context = module.GLContext(64, 64)
+    # Registered last, hence run first: before the library closes its display.
+    atexit.register(context.free)
+    return context
 
 
 def _prepare_graphics() -> None:
