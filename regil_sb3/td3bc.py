@@ -28,9 +28,10 @@ from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
 from stable_baselines3.td3.policies import MlpPolicy, MultiInputPolicy, TD3Policy
 from torch.nn import functional as F  # noqa: N812
 
+from regil_sb3.as_seen import as_seen
 from regil_sb3.policies import ImagePolicy
 from regil_sb3.replay_buffer import FrameReplayBuffer
-from regil_sb3.success_buffer import Observations, SuccessBuffer, stack_frames
+from regil_sb3.success_buffer import Observations, SuccessBuffer
 
 SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
 
@@ -229,16 +230,16 @@ class TD3BC(TD3):
                 n_steps=self.n_steps,
                 gamma=self.gamma,
             )
-        self.success_buffer = SuccessBuffer(self.success_buffer_size, self._success_stack())
+        self.success_buffer = SuccessBuffer(
+            self.success_buffer_size, self.n_stack if is_image_space(space) else 1
+        )
         if self.demo is not None and self.demo.actions is not None:
             self._add_demonstration(self.demo)
         super()._setup_model()
         self.replay_buffer_class = chosen
         self._guided = np.zeros(self.n_envs, bool)
+        self._returns: dict[str, list[float]] = {"env_reward": [], "retrieval_reward": []}
         self._forget_open_episodes()
-
-    def _success_stack(self) -> int:
-        return self.n_stack if is_image_space(self.observation_space) else 1
 
     def _check_demo(self) -> None:
         if self.bc_coef == 0:
@@ -251,59 +252,9 @@ class TD3BC(TD3):
             )
 
     def _add_demonstration(self, demo: Demonstration) -> None:
-        """Put the demonstration into the success buffer as the policy would have seen it."""
-        assert demo.actions is not None
         assert isinstance(self.action_space, spaces.Box)
-        n = len(demo.actions)
-        if demo.actions.shape[1:] != self.action_space.shape:
-            raise ValueError(
-                f"the demonstration has actions of shape {demo.actions.shape[1:]} but the "
-                f"environment takes {self.action_space.shape}"
-            )
-        low, high = self.action_space.low, self.action_space.high
-        scaled = 2.0 * (np.clip(demo.actions, low, high) - low) / (high - low) - 1.0
-        space = self.observation_space
-        observations: Observations
-        if is_image_space(space) and demo.observations is None:
-            assert space.shape is not None
-            frames = demo.frames[:n].transpose(0, 3, 1, 2)
-            if (frames.shape[1] * self.n_stack, *frames.shape[2:]) != space.shape:
-                height, width = space.shape[1:]
-                raise ValueError(
-                    f"the demonstration has {frames.shape[2]}x{frames.shape[3]} frames with "
-                    f"{frames.shape[1]} channels but the policy sees {height}x{width} with "
-                    f"{space.shape[0]} channels ({self.n_stack} stacked): "
-                    "record it again in this environment"
-                )
-            observations = stack_frames(frames, self.n_stack)
-        elif demo.observations is None:
-            raise ValueError(
-                "the policy does not see the frame, so the BC term needs the demonstration's "
-                "observations=: record it again in this environment, or set bc_coef=0 and demo=None"
-            )
-        elif isinstance(demo.observations, dict):
-            observations = {key: value[:n] for key, value in demo.observations.items()}
-        else:
-            observations = demo.observations[:n]
-        self._check_observations(observations)
-        self.success_buffer.add(observations, scaled.astype(np.float32), pinned=True)
-
-    def _check_observations(self, observations: Observations) -> None:
-        space = self.observation_space
-        got: Any = (
-            {k: v.shape[1:] for k, v in observations.items()}
-            if isinstance(observations, dict)
-            else observations.shape[1:]
-        )
-        want: Any = (
-            {k: s.shape for k, s in space.items()}
-            if isinstance(space, spaces.Dict)
-            else space.shape
-        )
-        if got != want:
-            raise ValueError(
-                f"the demonstration's observations have shape {got} but the policy sees {want}"
-            )
+        seen = as_seen(demo, self.observation_space, self.action_space, self.n_stack)
+        self.success_buffer.add(*seen, pinned=True)
 
     # -- collecting ------------------------------------------------------------------------------
 
@@ -330,14 +281,17 @@ class TD3BC(TD3):
             self.used_reward_scale = float(self.env.get_attr("reward_scale")[0]) if known else 1.0
         else:
             self.used_reward_scale = float(self.reward_scale)
+        begins_anew = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         if reset_num_timesteps:
             self.pretrained = False
-        self._guided = np.full(self.n_envs, self.num_timesteps < self.warmup_steps)
-        self._forget_open_episodes()
-        self._returns: dict[str, list[float]] = {"env_reward": [], "retrieval_reward": []}
+        if begins_anew:  # the environments were reset, whatever they were doing
+            self._guided = np.full(self.n_envs, self.num_timesteps < self.warmup_steps)
+            self._forget_open_episodes()
+            if isinstance(self.replay_buffer, FrameReplayBuffer):
+                self.replay_buffer.close_episodes()
         return result
 
     def _forget_open_episodes(self) -> None:

@@ -241,6 +241,19 @@ def test_saves_without_demonstration_and_buffers_and_loads(tmp_path):
     assert np.array_equal(model.predict(obs)[0], alone.predict(obs)[0])
 
 
+@pytest.mark.parametrize("reset", [True, False])
+def test_learning_again_in_the_middle_of_an_episode(reset):
+    model = small(stacked(n_envs=2), warmup_steps=200)
+    model.learn(70)
+    open_before = [len(e) for e in model._episodes]
+    assert any(open_before)
+    model.learn(70, reset_num_timesteps=reset)
+    assert model.num_timesteps == (70 if reset else 140)
+    first = [e.observations[0] for e in model.success_buffer._episodes]
+    dots = [np.flatnonzero(f.any(axis=(0, 1)))[0] for f in first]
+    assert max(dots) <= 12, "every kept episode starts where episodes start"
+
+
 def test_subprocesses_and_dict_observations():
     model = small(stacked(n_envs=2, vec=SubprocVecEnv))
     model.learn(70)

@@ -1,0 +1,86 @@
+"""A demonstration as the policy would have seen it: stacked observations and scaled actions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from regil_wrappers import Demonstration
+from stable_baselines3.common.preprocessing import is_image_space
+
+from regil_sb3.success_buffer import Observations, stack_frames
+
+
+def as_seen(
+    demo: Demonstration,
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Box,
+    n_stack: int,
+) -> tuple[Observations, npt.NDArray[np.float32]]:
+    """Turn a demonstration into a policy's observations and actions.
+
+    Args:
+        demo: with T actions.
+        observation_space: of the policy; images are channels first and ``n_stack`` frames deep.
+        action_space: of the environment.
+        n_stack: frames that an image observation stacks.
+
+    Returns:
+        What was seen before each action, (T, ...) or a dict of such, and the actions (T, A) scaled
+        to [-1, 1].
+
+    Raises:
+        ValueError: actions, frames or observations do not fit the spaces.
+    """
+    assert demo.actions is not None
+    if demo.actions.shape[1:] != action_space.shape:
+        raise ValueError(
+            f"the demonstration has actions of shape {demo.actions.shape[1:]} but the environment "
+            f"takes {action_space.shape}"
+        )
+    low, high = action_space.low, action_space.high
+    actions = 2.0 * (np.clip(demo.actions, low, high) - low) / (high - low) - 1.0
+    observations = _observations(demo, observation_space, n_stack)
+    got = _shapes(observations)
+    want = (
+        {key: space.shape for key, space in observation_space.items()}
+        if isinstance(observation_space, spaces.Dict)
+        else observation_space.shape
+    )
+    if got != want:
+        raise ValueError(
+            f"the demonstration's observations have shape {got} but the policy sees {want}"
+        )
+    return observations, actions.astype(np.float32)
+
+
+def _shapes(observations: Observations) -> Any:
+    if isinstance(observations, dict):
+        return {key: value.shape[1:] for key, value in observations.items()}
+    return observations.shape[1:]
+
+
+def _observations(demo: Demonstration, space: spaces.Space[Any], n_stack: int) -> Observations:
+    assert demo.actions is not None
+    n = len(demo.actions)
+    if isinstance(demo.observations, dict):
+        return {key: value[:n] for key, value in demo.observations.items()}
+    if demo.observations is not None:
+        return demo.observations[:n]
+    if not is_image_space(space):
+        raise ValueError(
+            "the policy does not see the frame, so the BC term needs the demonstration's "
+            "observations=: record it again in this environment, or set bc_coef=0 and demo=None"
+        )
+    assert space.shape is not None
+    frames = demo.frames[:n].transpose(0, 3, 1, 2)
+    if (frames.shape[1] * n_stack, *frames.shape[2:]) != space.shape:
+        channels, height, width = space.shape
+        raise ValueError(
+            f"the demonstration has {frames.shape[2]}x{frames.shape[3]} frames with "
+            f"{frames.shape[1]} channels but the policy sees {height}x{width} with {channels} "
+            f"channels ({n_stack} stacked): record it again in this environment"
+        )
+    return stack_frames(frames, n_stack)
