@@ -1,9 +1,11 @@
 # Each target makes the virtual environment .venv, or brings it up to date, by itself.
 PYTHON ?= python3
-# On Linux, PyPI's torch comes with several GB of CUDA. To get the CPU build instead:
-#   make run TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# On Linux, the registry's torch comes with several GB of CUDA. For the CPU build, name PyTorch's
+# own index of CPU builds (pytorch.org, "Get started"):
+#   make run TORCH_INDEX=...
 TORCH_INDEX ?=
-OUT ?= runs/quick
+# A run is never written over: each has a folder of its own
+OUT ?= runs/quick-$(shell date +%Y%m%d-%H%M%S)
 
 BIN := .venv/bin
 STAMP := .venv/installed

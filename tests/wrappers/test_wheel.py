@@ -16,6 +16,7 @@ PROJECT = HERE.parents[1] / "wrappers"
 
 
 @pytest.mark.packaging
+@pytest.mark.timeout(900)
 @pytest.mark.skipif(not (PROJECT / "setup.cfg").is_file(), reason="runs in the repository only")
 def test_the_wheel_alone(tmp_path: Path) -> None:
     clean = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "PYTEST"))}
@@ -52,7 +53,14 @@ def test_the_wheel_alone(tmp_path: Path) -> None:
     report = run(
         *(python, "-m", "pytest", "-q", "-W", "error", "-m", "not packaging"),
         # The repository's own configuration asks for plugins that this environment lacks.
-        *("-c", os.devnull, "--rootdir", HERE, "-o", "markers=packaging: builds a wheel"),
+        *(
+            "-c",
+            os.devnull,
+            "--rootdir",
+            HERE,
+            "-o",
+            "markers=packaging: a wheel\ntimeout: seconds",
+        ),
         *("-p", "no:cacheprovider", HERE),
     )
     assert " passed" in report
