@@ -88,7 +88,8 @@ class TD3BC(TD3):
         q_coef: weight of Q in the actor's loss; 0 is behaviour cloning on the success buffer alone,
             and no critic gradient reaches the actor's encoder.
         reward_scale: factor on rewards when they are sampled (the replay buffer keeps them raw);
-            "auto" asks the environment's ``reward_scale``, and is 1 where there is none.
+            "auto" asks the environment's ``reward_scale`` (1 / its unit) and makes one unit a step
+            for ever worth 10 in Q; it is 1 where the environment does not say.
         exploration_std: std of Gaussian exploration noise on scaled actions, clipped at
             ``exploration_clip``.
         exploration_clip: see there.
@@ -278,7 +279,9 @@ class TD3BC(TD3):
             )
         if self.reward_scale == "auto":
             known = self.env.has_attr("reward_scale")
-            self.used_reward_scale = float(self.env.get_attr("reward_scale")[0]) if known else 1.0
+            # Q of one unit a step for ever is 10, which a critic that starts near 0 reaches soon
+            own = float(self.env.get_attr("reward_scale")[0]) if known else 1.0
+            self.used_reward_scale = own * 10.0 * (1.0 - self.gamma) if known else 1.0
         else:
             self.used_reward_scale = float(self.reward_scale)
         begins_anew = reset_num_timesteps or self._last_obs is None

@@ -136,6 +136,7 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
 
     Example:
         >>> import gymnasium as gym
+        >>> import regil_sb3
         >>> env = gym.make("regil/metaworld-button-press-v0")
         >>> frame, info = env.reset(seed=0)
         >>> frame.shape, frame.dtype
