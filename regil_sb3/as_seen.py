@@ -41,6 +41,14 @@ def as_seen(
             f"takes {action_space.shape}"
         )
     low, high = action_space.low, action_space.high
+    outside = np.argwhere((demo.actions < low - 1e-6) | (demo.actions > high + 1e-6))
+    if len(outside):
+        step, i = outside[0]
+        raise ValueError(
+            f"the demonstration has action {demo.actions[step, i]:g} in dimension {i} of step "
+            f"{step} but the environment takes [{low[i]:g}, {high[i]:g}]: "
+            "record it in this environment"
+        )
     actions = 2.0 * (np.clip(demo.actions, low, high) - low) / (high - low) - 1.0
     observations = _observations(demo, observation_space, n_stack)
     got = _shapes(observations)
@@ -62,12 +70,22 @@ def _shapes(observations: Observations) -> Any:
     return observations.shape[1:]
 
 
+def _channels_first(values: npt.NDArray[Any], space: spaces.Space[Any]) -> npt.NDArray[Any]:
+    """Images (T, H, W, C) as SB3 transposes them for its policies; other values as they are."""
+    if is_image_space(space) and values.ndim == 4 and values.shape[1:] != space.shape:
+        values = np.transpose(values, (0, 3, 1, 2))
+    return values
+
+
 def _observations(demo: Demonstration, space: spaces.Space[Any], n_stack: int) -> Observations:
     assert demo.actions is not None
     n = len(demo.actions)
-    if isinstance(demo.observations, dict):
-        return {key: value[:n] for key, value in demo.observations.items()}
-    if demo.observations is not None:
+    if isinstance(space, spaces.Dict) and isinstance(demo.observations, dict):
+        missing = sorted(set(space.keys()) - set(demo.observations))
+        if missing:
+            raise ValueError(f"the demonstration's observations lack {', '.join(missing)}")
+        return {key: _channels_first(demo.observations[key][:n], one) for key, one in space.items()}
+    if isinstance(demo.observations, np.ndarray) and not is_image_space(space):
         return demo.observations[:n]
     if not is_image_space(space):
         raise ValueError(

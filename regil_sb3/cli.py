@@ -18,6 +18,7 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("env", help="id of the environment, e.g. regil/metaworld-button-press-v0")
     record.add_argument("-o", "--out", type=Path, help="file (demos/<id after the slash>.hdf5)")
     record.add_argument("--seed", type=int, default=0, help="first seed to try (0)")
+    record.add_argument("--size", type=int, help="height and width of the frames (84)")
     record.add_argument(
         "--encoder-size", type=int, help="keep larger frames of this size for the encoder too"
     )
@@ -98,6 +99,10 @@ def _train(args: argparse.Namespace) -> None:
     training.set_threads()
     if args.resume is None and not args.env:
         raise ValueError("--env is missing: name an environment, or --resume a run")
+    if args.resume is not None and (args.env or args.set or args.steps or args.preset or args.demo):
+        raise ValueError("--resume goes on with the run's own settings: give it alone")
+    if args.episodes < 1:
+        raise ValueError(f"--episodes is {args.episodes}: at least 1 is needed")
     run = args.resume or args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-{args.seed}"
     try:
         if args.resume is not None:
@@ -119,6 +124,8 @@ def _train(args: argparse.Namespace) -> None:
     except KeyboardInterrupt:
         if (run / "buffers.npz").exists():
             print(f"\nsaved; go on with: regil train --resume {run}", file=sys.stderr)
+        elif (run / "model.zip").exists():
+            print(f"\nthe model is in {run}: regil evaluate {run}", file=sys.stderr)
         raise
     _evaluate(run, args.episodes)
     _report(run, None)
@@ -128,7 +135,13 @@ def _evaluate(run: Path, episodes: int) -> None:
     from regil_sb3 import training
 
     training.keep_freed_memory()
-    results = training.evaluate_run(run, episodes)
+    if episodes < 1:
+        raise ValueError(f"--episodes is {episodes}: at least 1 is needed")
+    try:
+        results = training.evaluate_run(run, episodes)
+    except KeyboardInterrupt:
+        print(f"\nnot evaluated; later: regil evaluate {run}", file=sys.stderr)
+        raise
     print(f"\nSuccess over {episodes} unseen episodes, {results['steps']} steps of learning:")
     for name, title in (("policy", "policy"), ("guide", "guided replay"), ("bc", "BC on the demo")):
         if name in results:
@@ -151,7 +164,10 @@ def main(argv: list[str] | None = None) -> int:
             from regil_sb3.settings import pairs
 
             out = args.out or default_demo(args.env)
-            _record(args.env, out, args.seed, pairs(args.env_kwargs), args.encoder_size)
+            env_kwargs = pairs(args.env_kwargs)
+            if args.size is not None:
+                env_kwargs["size"] = args.size
+            _record(args.env, out, args.seed, env_kwargs, args.encoder_size)
         elif args.command == "train":
             _train(args)
         elif args.command == "evaluate":

@@ -12,8 +12,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import spaces
 from regil_wrappers import Demonstration
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import (
+    is_image_space,
+    is_image_space_channels_first,
+)
 from stable_baselines3.common.vec_env import VecEnv
 
 EVALUATION_SEED = 1_000_000
@@ -96,15 +101,17 @@ def evaluate(
         total, length, success, done = 0.0, 0, False, False
         while not done:
             if episode == 0:
-                result.first_frames += _frames(obs)
+                result.first_frames += _frames(obs, env)
             action = act(obs, env)
-            if episode == 0:
-                result.first_actions.append(np.array(action[0], np.float32))
+            if episode == 0 and isinstance(env.action_space, spaces.Box):
+                space = env.action_space  # float32 may put a bound outside by its last bit
+                kept = np.clip(action[0], space.low, space.high).astype(np.float32)
+                result.first_actions.append(kept)
             obs, rewards, dones, infos = env.step(action)
             total, length, done = total + float(rewards[0]), length + 1, bool(dones[0])
             success |= bool(infos[0].get("is_success", False))
         if episode == 0:
-            result.first_frames += _frames(infos[0]["terminal_observation"][None])
+            result.first_frames += _frames(infos[0]["terminal_observation"][None], env)
         result.successes.append(success)
         result.returns.append(total)
         result.lengths.append(length)
@@ -113,8 +120,11 @@ def evaluate(
     return result
 
 
-def _frames(obs: Any) -> list[npt.NDArray[np.uint8]]:
-    """The newest frame of an image observation (1, H, W, n * 3); nothing for other observations."""
-    if isinstance(obs, np.ndarray) and obs.ndim == 4 and obs.dtype == np.uint8:
-        return [obs[0, ..., -3:].copy()]
-    return []
+def _frames(obs: Any, env: VecEnv) -> list[npt.NDArray[np.uint8]]:
+    """The newest RGB frame of a (stacked) image observation; nothing for other observations."""
+    space = env.observation_space
+    if not (isinstance(space, spaces.Box) and is_image_space(space)):
+        return []
+    if is_image_space_channels_first(space):
+        return [obs[0, -3:].transpose(1, 2, 0).copy()]
+    return [obs[0, ..., -3:].copy()]

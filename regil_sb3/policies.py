@@ -12,12 +12,11 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
-
-_ENCODERS: dict[str, type[BaseFeaturesExtractor]] = {}
 
 
 def random_shift(images: th.Tensor, pad: int) -> th.Tensor:
@@ -138,7 +137,11 @@ class ResNet18Encoder(BaseFeaturesExtractor):
         return th.tanh(self.head(self.convolutions(observations)))
 
 
-_ENCODERS.update(conv=ConvEncoder, resnet18=ResNet18Encoder)
+_ENCODERS: dict[str, type[BaseFeaturesExtractor]] = {
+    "conv": ConvEncoder,
+    "resnet18": ResNet18Encoder,
+}
+_OWN = tuple(_ENCODERS.values())
 
 
 def _orthogonal(module: nn.Module) -> None:
@@ -182,6 +185,11 @@ class ImagePolicy(TD3Policy):
                 "share_features_extractor=True trains the encoder by the actor's loss alone: "
                 "use shared_encoder=True"
             )
+        if not is_image_space(observation_space):
+            raise ValueError(
+                f"CnnPolicy needs image observations (uint8, 0 to 255), not {observation_space}: "
+                "use MlpPolicy or MultiInputPolicy"
+            )
         if isinstance(features_extractor_class, str):
             if features_extractor_class not in _ENCODERS:
                 raise ValueError(
@@ -202,8 +210,11 @@ class ImagePolicy(TD3Policy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        self.actor.apply(_orthogonal)
-        self.critic.apply(_orthogonal)
+        for network in (self.actor, self.critic):
+            for name, module in network.named_children():
+                # an extractor class of the user's own may come with weights of its own
+                if name != "features_extractor" or self.features_extractor_class in _OWN:
+                    module.apply(_orthogonal)
         if self.shared_encoder:
             # The critic keeps gradients through the encoder, and its optimizer steps it.
             self.critic.features_extractor = self.actor.features_extractor

@@ -21,6 +21,10 @@ RETRIEVAL = {
     "regil_wrappers.RetrievalRewardWrapper": RetrievalRewardWrapper,
 }
 _WRAPPER_HOMES = ("regil_wrappers.", "gymnasium.wrappers.", "stable_baselines3.common.")
+_NOT_SETTABLE = {
+    *("env", "policy", "demo", "seed", "action_noise", "replay_buffer_class", "tensorboard_log"),
+    "_init_setup_model",
+}
 _OWN = ("n_timesteps", "n_envs", "frame_stack", "policy", "env_kwargs", "env_wrapper")
 
 
@@ -155,6 +159,10 @@ def make_settings(
         _override(settings, key, value)
     if steps is not None:
         settings.steps = steps
+    for name in ("steps", "n_envs", "frame_stack"):
+        value = getattr(settings, name)
+        if type(value) is not int or value < 1:
+            raise ValueError(f"{name} is {value!r}: it must be a whole number of at least 1")
     known = inspect.signature(TD3BC).parameters
     for name in settings.hyperparams:
         if name not in known:
@@ -174,10 +182,21 @@ def pairs(words: list[str]) -> dict[str, Any]:
         try:
             if not separator:
                 raise ValueError
-            out[key.strip()] = yaml.safe_load(text)
+            out[key.strip()] = _value(text)
         except (ValueError, yaml.YAMLError):
             raise ValueError(f"{word!r}: write KEY=VALUE, with VALUE as YAML") from None
     return out
+
+
+def _value(text: str) -> Any:
+    value = yaml.safe_load(text)
+    if isinstance(value, str):  # YAML 1.1 reads 3e-4 and 1e5 as text
+        try:
+            number = float(value)
+        except ValueError:
+            return value
+        return int(number) if number.is_integer() and "." not in value else number
+    return value
 
 
 def encoder_size(settings: Settings) -> int | None:
@@ -187,7 +206,7 @@ def encoder_size(settings: Settings) -> int | None:
 
 
 def _override(settings: Settings, key: str, value: Any) -> None:
-    model = set(inspect.signature(TD3BC).parameters) - {"env", "policy", "demo", "seed"}
+    model = set(inspect.signature(TD3BC).parameters) - _NOT_SETTABLE
     wrappers = {n for c in RETRIEVAL.values() for n in inspect.signature(c).parameters}
     wrappers -= {"env", "demo"}
     own = set(_OWN[:4])

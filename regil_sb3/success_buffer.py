@@ -67,6 +67,9 @@ class SuccessBuffer:
 
         Returns:
             Whether it was taken: an episode longer than what the demonstration leaves free is not.
+
+        Raises:
+            ValueError: a pinned episode is longer than the capacity.
         """
         kept: Observations
         if isinstance(observations, dict):
@@ -76,6 +79,11 @@ class SuccessBuffer:
             kept = np.array(self._newest(observations) if self.n_stack > 1 else observations)
         episode = _Episode(kept, np.array(actions, np.float32))
         if pinned:
+            if len(episode) > self.capacity:
+                raise ValueError(
+                    f"success_buffer_size is {self.capacity}: the demonstration alone has "
+                    f"{len(episode)} steps"
+                )
             self._pinned.append(episode)
         elif len(episode) > self.capacity - sum(map(len, self._pinned)):
             return False

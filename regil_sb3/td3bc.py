@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from os import PathLike
 from typing import Any, ClassVar, Literal, TypeVar
 
+import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import torch as th
@@ -24,7 +26,7 @@ from stable_baselines3.common.type_aliases import (
     TrainFrequencyUnit,
 )
 from stable_baselines3.common.utils import polyak_update, safe_mean
-from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 from stable_baselines3.td3.policies import MlpPolicy, MultiInputPolicy, TD3Policy
 from torch.nn import functional as F  # noqa: N812
 
@@ -34,6 +36,30 @@ from regil_sb3.replay_buffer import FrameReplayBuffer
 from regil_sb3.success_buffer import Observations, SuccessBuffer
 
 SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
+
+_CHOICES = {"bc_loss": ("mse", "nll"), "actor_q": ("min", "q1")}
+_NUMBER = (int, float)
+_RANGES: dict[str, tuple[tuple[type, ...], float, float]] = {
+    "buffer_size": ((int,), 1, np.inf),
+    "learning_starts": ((int,), 0, np.inf),
+    "batch_size": ((int,), 1, np.inf),
+    "tau": (_NUMBER, 0.0, 1.0),
+    "gamma": (_NUMBER, 0.0, 1.0),
+    "gradient_steps": (_NUMBER, -1, np.inf),
+    "n_steps": ((int,), 1, np.inf),
+    "policy_delay": ((int,), 1, np.inf),
+    "target_policy_noise": (_NUMBER, 0.0, np.inf),
+    "target_noise_clip": (_NUMBER, 0.0, np.inf),
+    "warmup_steps": ((int,), 0, np.inf),
+    "bc_coef": (_NUMBER, 0.0, np.inf),
+    "bc_floor": (_NUMBER, 0.0, 1.0),
+    "bc_std": (_NUMBER, 1e-6, np.inf),
+    "bc_pretrain_steps": ((int,), 0, np.inf),
+    "success_buffer_size": ((int,), 1, np.inf),
+    "q_coef": (_NUMBER, 0.0, np.inf),
+    "exploration_std": (_NUMBER, 0.0, np.inf),
+    "exploration_clip": (_NUMBER, 0.0, np.inf),
+}
 
 
 class TD3BC(TD3):
@@ -159,12 +185,18 @@ class TD3BC(TD3):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        for name, value, allowed in (
-            ("bc_loss", bc_loss, ("mse", "nll")),
-            ("actor_q", actor_q, ("min", "q1")),
-        ):
-            if value not in allowed:
-                raise ValueError(f"{name} is {value!r}: use one of {', '.join(allowed)}")
+        given = dict(locals())
+        for name, choices in _CHOICES.items():
+            if given[name] not in choices:
+                raise ValueError(f"{name} is {given[name]!r}: use one of {', '.join(choices)}")
+        for name, (kinds, least, most) in _RANGES.items():
+            _check_number(name, given[name], kinds, least, most)
+        if reward_scale != "auto":
+            _check_number("reward_scale", reward_scale, (int, float), 0.0, np.inf)
+        if bc_steps is not None:
+            _check_number("bc_steps", bc_steps, (int,), 1, np.inf)
+        if isinstance(env, gym.Env | VecEnv) and not isinstance(env.action_space, spaces.Box):
+            raise ValueError(f"the action space is {env.action_space}: TD3BC needs a Box")
         if q_coef == 0 and bc_coef == 0:
             raise ValueError("q_coef=0 and bc_coef=0 leave the actor nothing to learn from")
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
@@ -178,7 +210,9 @@ class TD3BC(TD3):
         self.bootstrap_success = bootstrap_success
         self.used_reward_scale = 1.0  # what "auto" turned out to be
         self.pretrained = False  # whether the BC updates at the end of warm-up are done
+        self.n_stack = 1
         self._updates_due = 0.0
+        self._in_step = False  # between an environment's step and its place in the replay buffer
         if _init_setup_model:
             self._check_demo()
         super().__init__(
@@ -211,8 +245,18 @@ class TD3BC(TD3):
 
     def _setup_model(self) -> None:
         space = self.observation_space
-        stacking = unwrap_vec_wrapper(self.env, VecFrameStack) if self.env is not None else None
-        self.n_stack = stacking.stacked_obs.n_stack if isinstance(stacking, VecFrameStack) else 1
+        if isinstance(self.demo, str | PathLike):  # as load(..., demo=PATH) hands it over
+            self.demo = Demonstration.load(self.demo)
+        if self.env is not None:  # without one, what was saved with the model holds
+            stacking = unwrap_vec_wrapper(self.env, VecFrameStack)
+            self.n_stack = (
+                stacking.stacked_obs.n_stack if isinstance(stacking, VecFrameStack) else 1
+            )
+        if self.bc_coef > 0 and self._vec_normalize_env is not None:
+            raise ValueError(
+                "the success buffer keeps observations as they are: leave out VecNormalize, "
+                "or set bc_coef=0"
+            )
         if isinstance(space, spaces.Dict) and self.n_steps > 1:
             raise ValueError(
                 f"n_steps={self.n_steps} with dict observations is not supported by SB3's replay "
@@ -227,9 +271,12 @@ class TD3BC(TD3):
                 self.action_space,
                 self.device,
                 self.n_envs,
-                n_stack=self.n_stack,
-                n_steps=self.n_steps,
-                gamma=self.gamma,
+                **{
+                    "n_stack": self.n_stack,
+                    "n_steps": self.n_steps,
+                    "gamma": self.gamma,
+                    **self.replay_buffer_kwargs,
+                },
             )
         self.success_buffer = SuccessBuffer(
             self.success_buffer_size, self.n_stack if is_image_space(space) else 1
@@ -284,6 +331,8 @@ class TD3BC(TD3):
             self.used_reward_scale = own * 10.0 * (1.0 - self.gamma) if known else 1.0
         else:
             self.used_reward_scale = float(self.reward_scale)
+        if self._in_step:  # interrupted there: the environment is ahead of the replay buffer
+            self._last_obs, self._in_step = None, False
         begins_anew = reset_num_timesteps or self._last_obs is None
         result = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
@@ -324,13 +373,16 @@ class TD3BC(TD3):
                 noise = np.random.normal(0, self.exploration_std, buffer_action.shape)
                 noise = noise.clip(-self.exploration_clip, self.exploration_clip)
                 buffer_action = (buffer_action + noise).clip(-1, 1).astype(np.float32)
+                # float32 may put an unscaled bound outside by its last bit
                 action = self.policy.unscale_action(buffer_action)
+                action = action.clip(self.action_space.low, self.action_space.high)
         if self._guided.any():
             indices = np.flatnonzero(self._guided)
             suggested = np.stack(self.env.env_method("guide_action", indices=indices.tolist()))
             suggested = suggested.clip(self.action_space.low, self.action_space.high)
             action[indices] = suggested
             buffer_action[indices] = self.policy.scale_action(suggested)
+        self._in_step = True
         return action, buffer_action
 
     def _update_info_buffer(
@@ -368,6 +420,7 @@ class TD3BC(TD3):
             self._running["retrieval_reward"][i] += reward[i]
             if dones[i]:
                 self._end_episode(i)
+        self._in_step = False
 
     def _end_episode(self, env: int) -> None:
         if self._guided[env] and self._succeeded[env]:
@@ -377,7 +430,13 @@ class TD3BC(TD3):
                 if isinstance(seen[0], dict)
                 else np.stack(seen)
             )
-            self.success_buffer.add(observations, np.stack(actions))
+            if not self.success_buffer.add(observations, np.stack(actions)):
+                warnings.warn(
+                    f"a successful episode of {len(actions)} steps does not fit beside the "
+                    f"demonstration into success_buffer_size={self.success_buffer_size}: it is "
+                    "not kept",
+                    stacklevel=2,
+                )
         for name, running in self._running.items():
             self._returns[name].append(float(running[env]))
             del self._returns[name][: -self._stats_window_size]
@@ -441,6 +500,8 @@ class TD3BC(TD3):
             steps: updates.
             progress: called with the number of updates done after each.
         """
+        if steps < 1:
+            return
         self.policy.set_training_mode(True)
         for done in range(1, steps + 1):
             loss = self._bc_term()
@@ -451,8 +512,7 @@ class TD3BC(TD3):
             if progress is not None:
                 progress(done)
         self.actor_target.load_state_dict(self.actor.state_dict())
-        if steps:
-            self.logger.record("train/bc_loss", loss.item())
+        self.logger.record("train/bc_loss", loss.item())
 
     def _require_finite(self, name: str, value: float) -> None:
         if not np.isfinite(value):
@@ -601,12 +661,24 @@ class TD3BC(TD3):
             *super()._excluded_save_params(),
             "demo",
             "success_buffer",
+            "_in_step",
             "_episodes",
             "_guided",
             "_succeeded",
             "_running",
             "_returns",
         ]
+
+
+def _check_number(
+    name: str, value: Any, kinds: tuple[type, ...], least: float, most: float
+) -> None:
+    """Refuse what is no number of these kinds within [least, most], in one line."""
+    fits = isinstance(value, (*kinds, np.integer)) and not isinstance(value, bool)
+    if not fits or not least <= value <= most:
+        kind = "a whole number" if kinds == (int,) else "a number"
+        upper = f" and at most {most:g}" if most < np.inf else ""
+        raise ValueError(f"{name} is {value!r}: it must be {kind} of at least {least:g}{upper}")
 
 
 def encode(network: Any, observations: Any) -> th.Tensor:

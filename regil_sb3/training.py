@@ -75,13 +75,16 @@ def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEn
             env = wrapper(env, **arguments)
         return env
 
-    env: VecEnv = make_vec_env(
-        settings.env,
-        n_envs=n_envs or settings.n_envs,
-        seed=settings.seed,
-        wrapper_class=wrap,
-        env_kwargs=settings.env_kwargs,
-    )
+    try:
+        env: VecEnv = make_vec_env(
+            settings.env,
+            n_envs=n_envs or settings.n_envs,
+            seed=settings.seed,
+            wrapper_class=wrap,
+            env_kwargs=settings.env_kwargs,
+        )
+    except TypeError as error:  # an argument that the environment or a wrapper does not have
+        raise ValueError(f"{settings.env} cannot be made with these settings: {error}") from error
     if settings.frame_stack > 1:
         env = VecFrameStack(env, settings.frame_stack)
     return env
@@ -102,6 +105,7 @@ class _AppendingCSV(CSVOutputFormat):
         if old:
             self.keys = old.splitlines()[0].split(",")
             self.file.write(old)
+            self.file.flush()
 
 
 def _best_so_far(log: Path) -> float:
@@ -134,7 +138,7 @@ class TrainingCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._next = (self.num_timesteps // self.every + 1) * self.every
-        self._first = not self._td3bc.pretrained
+        self._first = self.best < 0
         self._bar.reset(self._td3bc._total_timesteps)
         self._bar.initial = self._bar.n = self.num_timesteps
 
@@ -145,8 +149,8 @@ class TrainingCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         if self._first and self._td3bc.pretrained:
-            self._first = False
             self._evaluate()
+            self._first = False
 
     def _on_step(self) -> bool:
         model = self._td3bc
@@ -155,11 +159,11 @@ class TrainingCallback(BaseCallback):
             self._describe()
         self.logger.record("time/frames", self.num_timesteps * self._repeat)
         if self.num_timesteps >= self._next:
-            self._next += self.every
             if not model.guided:
                 self._evaluate()
             else:
                 save_model(model, self.run / "model.zip")
+            self._next += self.every
         return True
 
     def _describe(self) -> None:
@@ -204,9 +208,10 @@ def save_model(model: TD3BC, path: Path) -> None:
 
 
 def _save_buffers(model: TD3BC, path: Path) -> None:
-    buffers = {"success": model.success_buffer.state()}
-    if isinstance(model.replay_buffer, FrameReplayBuffer):
-        buffers["replay"] = model.replay_buffer.state()
+    """Save what ``resume`` needs; SB3's own replay buffers (no images) have no such form."""
+    if not isinstance(model.replay_buffer, FrameReplayBuffer):
+        return
+    buffers = {"success": model.success_buffer.state(), "replay": model.replay_buffer.state()}
     arrays: dict[str, Any] = {
         f"{name}/{k}": v for name, state in buffers.items() for k, v in state.items()
     }
@@ -262,7 +267,13 @@ def train(settings: Settings, demo: Demonstration, run: Path) -> None:
     run.mkdir(parents=True, exist_ok=True)
     demo.save(run / "demo.hdf5")
     with _environments(settings, run / "demo.hdf5") as (env, eval_env):
-        model = TD3BC(settings.policy, env, demo=demo, seed=settings.seed, **settings.hyperparams)
+        model = _new_model(settings, demo, env)
+        if settings.steps <= model.warmup_steps:
+            raise ValueError(
+                f"{settings.steps} steps end before the warm-up of {model.warmup_steps} does: take "
+                "more --steps, or a smaller --set warmup_steps=N"
+            )
+        env.reset()  # where the retrieval wrappers compare first frames
         settings.save(
             run / "config.yaml",
             encoder=settings.retrieval("encoder"),
@@ -313,10 +324,17 @@ def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> Non
         model.logger.close()
 
 
+def _new_model(settings: Settings, demo: Demonstration, env: VecEnv, **changes: Any) -> TD3BC:
+    hyperparams = {**settings.hyperparams, **changes}
+    try:
+        return TD3BC(settings.policy, env, demo=demo, seed=settings.seed, **hyperparams)
+    except TypeError as error:  # an argument of the policy's that does not exist
+        raise ValueError(f"the settings do not fit TD3BC or its policy: {error}") from error
+
+
 def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int) -> TD3BC:
     """The "BC" of tables: the run's network, augmentation and batch, on the demonstration alone."""
-    hyperparams = {**settings.hyperparams, "buffer_size": 1, "warmup_steps": 0, "bc_coef": 1.0}
-    model = TD3BC(settings.policy, env, demo=demo, seed=settings.seed, **hyperparams)
+    model = _new_model(settings, demo, env, buffer_size=1, warmup_steps=0, bc_coef=1.0)
     model.set_logger(Logger(None, []))
     with tqdm(total=updates, desc="behaviour cloning", unit="update", dynamic_ncols=True) as bar:
 
@@ -348,9 +366,9 @@ def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
     demo = Demonstration.load(run / "demo.hdf5")
     env = make_env(settings, run / "demo.hdf5", n_envs=1)
     try:
-        model = TD3BC.load(run / "model.zip")
+        model = TD3BC.load(run / "model.zip", buffer_size=1)
         if (run / "bc_model.zip").exists():
-            bc = TD3BC.load(run / "bc_model.zip")
+            bc = TD3BC.load(run / "bc_model.zip", buffer_size=1)
         else:
             bc = train_bc(settings, demo, env, BC_UPDATES)
             save_model(bc, run / "bc_model.zip")
@@ -371,15 +389,16 @@ def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
                 result = evaluate(act, env, episodes, EVALUATION_SEED, show)
             results[name] = result.as_dict()
             if name == "policy":
-                episode = result.first_episode({**demo.metadata, "seed": EVALUATION_SEED})
-                if episode is not None:
-                    episode.save(run / "episode.hdf5")
+                policy_result = result
         results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
     finally:
         env.close()
     temporary = run / ".evaluation.json"
     temporary.write_text(json.dumps(results, indent=1), encoding="utf-8")
     temporary.replace(run / "evaluation.json")
+    episode = policy_result.first_episode({**demo.metadata, "seed": EVALUATION_SEED})
+    if episode is not None:
+        episode.save(run / "episode.hdf5")
     return results
 
 

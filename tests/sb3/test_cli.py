@@ -170,6 +170,8 @@ def test_presets_are_plain_yaml_and_fit():
     ("override", "where", "value"),
     [
         ("bc_coef=0.5", lambda s: s.hyperparams["bc_coef"], 0.5),
+        ("learning_rate=3e-4", lambda s: s.hyperparams["learning_rate"], 3e-4),
+        ("buffer_size=1e5", lambda s: s.hyperparams["buffer_size"], 100_000),
         ("k=9", lambda s: s.retrieval("k"), 9),
         ("frame_stack=3", lambda s: s.frame_stack, 3),
         ("env_kwargs.camera=corner2", lambda s: s.env_kwargs, {"camera": "corner2"}),
@@ -196,6 +198,12 @@ def test_overrides(override, where, value):
         (["train", "--env", ENV, "--set", "bc_coef"], "write KEY=VALUE"),
         (["train", "--env", ENV, "--set", "encoder=vgg"], "pixels"),
         (["train", "--env", "regil/metaworld-fly-v0"], "metaworld-fly"),
+        (["train", "--env", ENV, "--episodes", "0"], "--episodes is 0"),
+        (["train", "--env", ENV, "--set", "frame_stack=two"], "frame_stack is 'two'"),
+        (["train", "--env", ENV, "--set", "n_envs=0"], "n_envs is 0"),
+        (["train", "--env", ENV, "--set", "action_noise=normal"], "no setting has that name"),
+        (["train", "--resume", "nowhere", "--steps", "9"], "give it alone"),
+        (["evaluate", "nowhere", "--episodes", "-1"], "--episodes is -1"),
         (["train", "--resume", "nowhere"], "nowhere is not a run folder"),
         (["evaluate", "nowhere"], "nowhere is not a run folder"),
         (["report", "nowhere"], "nowhere"),
@@ -210,6 +218,37 @@ def test_bad_input_is_one_line_and_status_2(words, message, tmp_path, monkeypatc
     assert message in error
     assert len(error.strip().splitlines()) == 1, error
     assert not list(tmp_path.rglob("*.hdf5"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--set", "env_kwargs.nonsense=1"], "nonsense"),
+        (["--set", "policy_kwargs.foo=1"], "foo"),
+        (["--set", "bc_steps=0"], "bc_steps is 0"),
+        (["--steps", "3000"], "end before the warm-up of 5000"),
+        (["--set", "env_kwargs.camera=corner"], "camera"),
+        (["--set", "env_kwargs.size=96"], "--size 96"),
+    ],
+)
+def test_a_run_that_cannot_start_leaves_its_folder_free(change, message, demo, tmp_path, capsys):
+    folder = tmp_path / "run"
+    words = ["train", "--env", ENV, "--demo", str(demo), "--out", str(folder)]
+    assert main([*words, *change]) == 2
+    assert message in capsys.readouterr().err
+    assert not (folder / "config.yaml").exists()
+
+
+def test_upside_down_demonstration_is_refused_before_the_run_begins(demo, tmp_path, capsys):
+    upright = Demonstration.load(demo)
+    Demonstration(
+        frames=upright.frames[:, ::-1], actions=upright.actions, metadata=upright.metadata
+    ).save(tmp_path / "down.hdf5")
+    folder = tmp_path / "run"
+    words = ["train", "--env", ENV, "--demo", str(tmp_path / "down.hdf5"), "--out", str(folder)]
+    assert main(words) == 2
+    assert "upside down" in capsys.readouterr().err
+    assert not (folder / "config.yaml").exists()
 
 
 def test_missing_demonstration_names_what_to_do(tmp_path, monkeypatch, capsys):

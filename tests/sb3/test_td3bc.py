@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from regil_wrappers import Demonstration
 from stable_baselines3 import TD3
 from stable_baselines3.common.logger import Logger, configure
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 from toy import Reach, demonstration, stacked
 
 from regil_sb3 import TD3BC
@@ -239,6 +240,11 @@ def test_saves_without_demonstration_and_buffers_and_loads(tmp_path):
     assert loaded.num_timesteps == 120
     alone = TD3BC.load(tmp_path / "model")
     assert np.array_equal(model.predict(obs)[0], alone.predict(obs)[0])
+    assert alone.n_stack == 2
+    assert alone.replay_buffer.frames.nbytes == model.replay_buffer.frames.nbytes
+    demonstration().save(tmp_path / "demo.hdf5")
+    by_path = TD3BC.load(tmp_path / "model", env=env, demo=str(tmp_path / "demo.hdf5"))
+    assert by_path.success_buffer.episodes == 1
 
 
 @pytest.mark.parametrize("reset", [True, False])
@@ -252,6 +258,53 @@ def test_learning_again_in_the_middle_of_an_episode(reset):
     first = [e.observations[0] for e in model.success_buffer._episodes]
     dots = [np.flatnonzero(f.any(axis=(0, 1)))[0] for f in first]
     assert max(dots) <= 12, "every kept episode starts where episodes start"
+
+
+def test_going_on_after_a_callback_stopped_in_a_step():
+    from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+
+    model = small(stacked(), warmup_steps=200)
+    model.learn(100, callback=StopTrainingOnMaxEpisodes(2))
+    model.learn(50, reset_num_timesteps=False)
+    last_stored = model.num_timesteps - 50 - 2  # the step that was stopped in is not stored
+    assert model.replay_buffer.dones[last_stored, 0]  # closed, and not joined with the next episode
+    lengths = [len(e) for e in model.success_buffer._episodes]
+    assert all(length <= Reach.LENGTH for length in lengths)
+
+
+def test_pretraining_by_nothing_leaves_the_target_alone():
+    model = small(stacked())
+    model.learn(40)
+    before = [p.clone() for p in model.actor_target.parameters()]
+    model.pretrain_bc(0)
+    assert all(th.equal(a, b) for a, b in zip(before, model.actor_target.parameters(), strict=True))
+
+
+def test_demonstration_with_observations_trains_an_image_policy():
+    demo = demonstration()
+    with_x = Demonstration(
+        frames=demo.frames,
+        actions=demo.actions,
+        observations={"x": np.zeros((len(demo), 1), np.float32)},
+    )
+    assert small(stacked(), demo=with_x).success_buffer.sample(1)[0].shape == (1, 6, 40, 40)
+
+
+def test_executed_actions_stay_inside_asymmetric_bounds():
+    from gymnasium import spaces
+
+    env = Reach()
+    env.action_space = spaces.Box(
+        np.array([-0.44, -1.0], np.float32), np.array([0.11, 1.0], np.float32)
+    )
+    demo = Demonstration(
+        frames=demonstration().frames,
+        actions=np.zeros((len(demonstration().actions), 2), np.float32),
+    )
+    model = small(VecFrameStack(DummyVecEnv([lambda: env]), 2), demo=demo, warmup_steps=0,
+                  exploration_std=5.0, exploration_clip=5.0)  # fmt: skip
+    model.learn(120)
+    assert all(env.action_space.contains(action) for action in env.executed[20:])
 
 
 def test_subprocesses_and_dict_observations():
@@ -280,6 +333,15 @@ def test_subprocesses_and_dict_observations():
         ({"actor_q": "q2"}, "use one of min, q1"),
         ({"demo": "no-such-file.hdf5"}, "no-such-file.hdf5"),
         ({"success_buffer_size": 0}, "success_buffer_size is 0"),
+        ({"success_buffer_size": 3}, "the demonstration alone has"),
+        ({"buffer_size": 1e5}, "buffer_size is 100000.0: it must be a whole number"),
+        ({"policy_delay": 0}, "policy_delay is 0"),
+        ({"bc_steps": 0}, "bc_steps is 0"),
+        ({"bc_coef": -1}, "bc_coef is -1"),
+        ({"bc_std": 0}, "bc_std is 0"),
+        ({"gamma": 1.5}, "at most 1"),
+        ({"warmup_steps": "many"}, "warmup_steps is 'many'"),
+        ({"reward_scale": "automatic"}, "reward_scale is 'automatic'"),
         ({"policy_kwargs": {"share_features_extractor": True}}, "shared_encoder"),
         ({"policy_kwargs": {"features_extractor_class": "vgg"}}, "conv, resnet18"),
     ],
@@ -293,6 +355,15 @@ def test_bad_combinations():
     demo = demonstration()
     with pytest.raises(ValueError, match="has no actions"):
         small(stacked(), demo=Demonstration(frames=demo.frames))
+    loud = Demonstration(frames=demo.frames, actions=5 * demo.actions)
+    with pytest.raises(ValueError, match=r"has action 3\.5 in dimension 0 of step 0"):
+        small(stacked(), demo=loud, warmup_steps=0)
+    with pytest.raises(ValueError, match="CnnPolicy needs image observations"):
+        TD3BC("CnnPolicy", "Pendulum-v1", **OFF)
+    with pytest.raises(ValueError, match="TD3BC needs a Box"):
+        TD3BC("MlpPolicy", gym.make("CartPole-v1"), **OFF)
+    with pytest.raises(ValueError, match="leave out VecNormalize"):
+        small(VecNormalize(stacked()))
     small_frames = Demonstration(frames=demo.frames[:, :36, :36], actions=demo.actions)
     with pytest.raises(ValueError, match=r"36x36 frames .* policy sees 40x40"):
         small(stacked(), demo=small_frames)
