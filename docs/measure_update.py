@@ -1,14 +1,11 @@
-"""Decides two defaults: how the encoder's convolutions are computed, and glibc's allocator.
+"""Decides how the encoder's convolutions are computed.
 
     python docs/measure_update.py
 
 Forward and forward + backward of the default encoder on a batch of 64 observations of 84x84x6, one
-thread, medians in ms. Each allocator setting runs in a process of its own, the variants of the
-network in turn within it.
+thread, medians in ms; the variants of the network take turns.
 """
 
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -17,7 +14,6 @@ from gymnasium import spaces
 from torch import nn
 
 from regil_sb3.policies import ConvEncoder
-from regil_sb3.training import keep_freed_memory
 
 SPACE = spaces.Box(0, 255, (6, 84, 84), np.uint8)
 ROUNDS = 30
@@ -40,9 +36,7 @@ class ChannelsLast(ConvEncoder):
         return super().forward(observations.contiguous(memory_format=th.channels_last))
 
 
-def main(allocator: str) -> None:
-    if allocator == "kept":
-        keep_freed_memory()
+def main() -> None:
     th.set_num_threads(1)
     networks = {"plain": ConvEncoder, "channels last": ChannelsLast, "space to depth": SpaceToDepth}
     built = {name: network(SPACE) for name, network in networks.items()}
@@ -61,17 +55,11 @@ def main(allocator: str) -> None:
             optimizers[name].step()
             times[name, "forward"].append(middle - start)
             times[name, "both"].append(time.perf_counter() - middle)
+    print("| network | forward (ms) | forward + backward (ms) |\n|---|---|---|")
     for name in built:
         forward, both = (1e3 * np.median(times[name, kind]) for kind in ("forward", "both"))
-        print(f"| {name} | {allocator} | {forward:.1f} | {both:.1f} |", flush=True)
+        print(f"| {name} | {forward:.1f} | {both:.1f} |")
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        main(sys.argv[1])
-    else:
-        print(
-            "| network | freed memory | forward (ms) | forward + backward (ms) |\n|---|---|---|---|"
-        )
-        for allocator in ("returned", "kept"):
-            subprocess.run([sys.executable, __file__, allocator], check=True)
+    main()

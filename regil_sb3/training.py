@@ -9,10 +9,8 @@
 from __future__ import annotations
 
 import csv
-import ctypes
 import json
 import os
-import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,17 +42,6 @@ from regil_sb3.td3bc import TD3BC
 
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
 SELECTION_EPISODES = 10  # each time the policy is evaluated during training
-
-
-def keep_freed_memory() -> None:
-    """Stop glibc from handing freed tensors back to the system and asking for them again.
-
-    On a CPU that nearly halves the time of a convolutional update (docs/performance.md).
-    """
-    if platform.system() == "Linux" and platform.libc_ver()[0] == "glibc":
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-        for parameter, value in ((-3, 1 << 30), (-1, (1 << 31) - 1), (-2, 1 << 28)):
-            mallopt(parameter, value)  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_TOP_PAD
 
 
 def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEnv:
