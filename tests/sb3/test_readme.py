@@ -33,6 +33,8 @@ def run(code, **shorter):
     return names
 
 
+# SB3's progress bar is tqdm's rich one, which calls itself experimental
+@pytest.mark.filterwarnings("ignore::tqdm.TqdmExperimentalWarning")
 def test_library(here):
     names = run(BLOCKS[0], steps=("learn(15_000", "learn(60"))
     assert names["model"].num_timesteps == 60
