@@ -325,10 +325,11 @@ class TD3BC(TD3):
                 "regil_wrappers.RetrievalGuideWrapper, or set warmup_steps=0"
             )
         if self.reward_scale == "auto":
-            known = self.env.has_attr("reward_scale")
-            # Q of one unit a step for ever is 10, which a critic that starts near 0 reaches soon
-            own = float(self.env.get_attr("reward_scale")[0]) if known else 1.0
-            self.used_reward_scale = own * 10.0 * (1.0 - self.gamma) if known else 1.0
+            self.used_reward_scale = 1.0
+            if self.env.has_attr("reward_scale"):
+                # Q of one unit a step for ever is 10: a critic that starts near 0 gets there soon
+                own = float(self.env.get_attr("reward_scale")[0])
+                self.used_reward_scale = own * 10.0 * (1.0 - self.gamma)
         else:
             self.used_reward_scale = float(self.reward_scale)
         if self._in_step:  # interrupted there: the environment is ahead of the replay buffer

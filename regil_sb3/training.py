@@ -13,6 +13,7 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedWriter
 from pathlib import Path
 from typing import Any
 
@@ -184,14 +185,21 @@ class TrainingCallback(BaseCallback):
         self._bar.close()
 
 
-def save_model(model: TD3BC, path: Path) -> None:
-    """Save beside the old file, then replace it in one step."""
+@contextmanager
+def _replacing(path: Path) -> Iterator[BufferedWriter]:
+    """Write beside the old file, then replace it in one step: a failed write loses nothing."""
     temporary = path.with_name(f".{path.name}")
     with temporary.open("wb") as file:
-        model.save(file)
+        yield file
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+
+
+def save_model(model: TD3BC, path: Path) -> None:
+    """Save a model; the old file stays until the new one is complete."""
+    with _replacing(path) as file:
+        model.save(file)
 
 
 def _save_buffers(model: TD3BC, path: Path) -> None:
@@ -202,10 +210,8 @@ def _save_buffers(model: TD3BC, path: Path) -> None:
     arrays: dict[str, Any] = {
         f"{name}/{k}": v for name, state in buffers.items() for k, v in state.items()
     }
-    temporary = path.with_name(f".{path.name}")
-    with temporary.open("wb") as file:
+    with _replacing(path) as file:
         np.savez(file, **arrays)
-    temporary.replace(path)
 
 
 def _load_buffers(model: TD3BC, path: Path) -> None:
@@ -380,9 +386,8 @@ def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
         results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
     finally:
         env.close()
-    temporary = run / ".evaluation.json"
-    temporary.write_text(json.dumps(results, indent=1), encoding="utf-8")
-    temporary.replace(run / "evaluation.json")
+    with _replacing(run / "evaluation.json") as file:
+        file.write(json.dumps(results, indent=1).encode())
     episode = policy_result.first_episode({**demo.metadata, "seed": EVALUATION_SEED})
     if episode is not None:
         episode.save(run / "episode.hdf5")
