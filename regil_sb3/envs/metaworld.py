@@ -264,8 +264,10 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
                 "control_rate": control_rate,
                 "translation_dims": [0, 1, 2],
                 "gripper_dim": 3,
-                "plane": [10, 10, 0.5],
-                "mirror": "auto",
+                # An action moves the hand 1 cm a repeat; targets move by 10 cm in the plane.
+                "plane": [10 / action_repeat, 10 / action_repeat, 0.5 / action_repeat],
+                # Rows flipped alone mirror a camera that hangs upside down.
+                "mirror": -1 if self._upside_down else 1,
             },
         }
 

@@ -360,8 +360,8 @@ def test_metadata_describes_this_instance(make):
         "control_rate": 40.0,
         "translation_dims": [0, 1, 2],
         "gripper_dim": 3,
-        "plane": [10, 10, 0.5],
-        "mirror": "auto",
+        "plane": [5.0, 5.0, 0.25],
+        "mirror": -1,
     }
     ours = slow.metadata["regil"]
     assert (ours["camera"], ours["image_size"], ours["control_rate"]) == ("corner3", [64, 64], 20.0)

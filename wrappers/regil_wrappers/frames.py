@@ -99,6 +99,15 @@ class FrameSource:
         self._encoder_size = larger.shape[1]
         return True
 
+    @property
+    def recorded_first(self) -> NDArray[np.uint8]:
+        """The demonstration's first picture of the kind that `current` gives, (H, W, 3) uint8."""
+        if self._encoder_size is not None:
+            frames = cast("NDArray[np.uint8]", self._demo.encoder_frames)
+        else:
+            frames = self._demo.frames
+        return cast("NDArray[np.uint8]", frames[0])
+
     def current(self, observation: Any) -> NDArray[np.uint8]:
         """The current picture, (H, W, 3) uint8; the very first one is compared with the recording.
 
@@ -110,10 +119,8 @@ class FrameSource:
         """
         if self._encoder_size is not None:
             frame = self._env.get_wrapper_attr("encoder_frame")(self._encoder_size)
-            recorded = cast("NDArray[np.uint8]", self._demo.encoder_frames)[0]
         else:
             frame = self._env.render() if self._render else observation
-            recorded = self._demo.frames[0]
         if self._key is not None:
             frame = frame[self._key]
         if self._channels_first:
@@ -122,6 +129,7 @@ class FrameSource:
             got = f"{getattr(frame, 'dtype', type(frame).__name__)} {np.shape(frame)}"
             raise ValueError(f"the environment's picture is {got}: it must be uint8 (H, W, 3)")
         if not self._first_is_checked:
+            recorded = self.recorded_first
             check_size(frame.shape[:2], recorded.shape[:2], self._label)
             check_upright(frame, recorded, self._label)
             self._first_is_checked = True

@@ -108,6 +108,11 @@ class Retriever:
         self._rows = np.empty((64 + horizon, len(frames)))
         self.reset()
 
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """(height, width) px of the pictures that `step` takes."""
+        return self._frame_shape[0], self._frame_shape[1]
+
     def reset(self) -> None:
         """Forget the episode: the next frame is its first."""
         self._top = 0
@@ -182,6 +187,19 @@ class Retriever:
         self._rows[self._bottom] = distances
         self._bottom += 1
         self._steps += 1
+
+    def end_costs(self) -> NDArray[np.float64]:
+        """D(H+1, j) / window for every frame j, (N,) float64: the best cost of ending there.
+
+        Unlike `Alignment.cost` it looks beyond q*. Infinite where no path ends.
+
+        Raises:
+            ValueError: before the first step of an episode.
+        """
+        window = self.alignment.window
+        table = accumulated_costs(self._rows[self._top : self._bottom], self.step_pattern)
+        costs: NDArray[np.float64] = table[-1] / window
+        return costs
 
     def path(self) -> list[tuple[int, int]]:
         """The last step's warping path: (frame of the window, frame of the demonstration), 0-based.

@@ -22,15 +22,17 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from regil_wrappers.alignment import StepPattern
+from regil_wrappers.correction import Servo
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.encoders import Encoder, make_encoder
 from regil_wrappers.frames import FrameSource, check_recorded_settings
+from regil_wrappers.registration import Displacement, moved_back, register
 from regil_wrappers.retrieval import Alignment, Retriever, check_settings
-from regil_wrappers.rewards import demonstration_tau, sdtw_reward
+from regil_wrappers.rewards import arc_length, demonstration_tau, progress_reward, sdtw_reward
 
 __all__ = ["RetrievalGuideWrapper", "RetrievalRewardWrapper"]
 
-_REWARDS = ("sdtw",)
+_REWARDS = ("sdtw", "progress")
 
 
 class _RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
@@ -49,6 +51,9 @@ class _RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         self.demonstration = demo
         self.retrieval_settings = settings
         self._frames = frames
+        self._frame: NDArray[np.uint8] | None = None
+        self._first_frame: NDArray[np.uint8] | None = None
+        self._displacement: Displacement | None = None
         if frames is None:
             self.retriever: Retriever = env.get_wrapper_attr("retriever")
             return
@@ -85,15 +90,50 @@ class _RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         observation, info = self.env.reset(seed=seed, options=options)
         if self._frames is not None:
             self.retriever.reset()
-            self.retriever.step(self._frames.current(observation))
+            self._first_frame, self._displacement = None, None
+            self._align(observation)
         return observation, info
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the environment and align the frame that follows."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         if self._frames is not None:
-            self.retriever.step(self._frames.current(observation))
+            self._align(observation)
         return observation, reward, terminated, truncated, info
+
+    def _align(self, observation: ObsType) -> None:
+        assert self._frames is not None
+        self._frame = frame = self._frames.current(observation)
+        if self._first_frame is None:
+            self._first_frame = frame.copy()
+            self._registered = False
+        if self.retrieval_settings["register"]:
+            frame = moved_back(frame, self.displacement)
+        self.retriever.step(frame)
+
+    @property
+    def retrieval_frame(self) -> NDArray[np.uint8]:
+        """The picture aligned last, (H, W, 3) uint8, as the camera saw it."""
+        if self._frames is None:
+            frame = self.env.get_wrapper_attr("retrieval_frame")
+        elif (frame := self._frame) is None:
+            raise ValueError("there is no picture yet: call reset() of the environment")
+        return cast("NDArray[np.uint8]", frame)
+
+    @property
+    def displacement(self) -> Displacement | None:
+        """What moved between the demonstration's first picture and this episode's; None: nothing.
+
+        Found when it is first asked for in an episode (about 0.1 s).
+        """
+        if self._frames is None:
+            return cast("Displacement | None", self.env.get_wrapper_attr("displacement"))
+        if self._first_frame is None:
+            raise ValueError("there is no picture yet: call reset() of the environment")
+        if not self._registered:
+            self._displacement = register(self._frames.recorded_first, self._first_frame)
+            self._registered = True
+        return self._displacement
 
     def _with_retrieval(self, info: dict[str, Any], **own: Any) -> dict[str, Any]:
         a = self.alignment
@@ -110,6 +150,13 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
     It never changes an action: whoever chooses actions asks `guide_action()`. Observations and
     rewards pass through. ``info["retrieval"]`` holds ``start``, ``end`` (frames of the
     demonstration), ``cost`` and ``guide_action``.
+
+    With ``correction="servo"`` the suggested actions go where the target is now. The first episodes
+    that follow the guide then begin with moves that show it how the camera sees the hand. From
+    there on ``info["retrieval"]["guide"]`` says what it suggests: "calibration", "corrected",
+    "released" (no correction after a grasp) or "plain" (the demonstrator's own action), and
+    ``info["retrieval"]["calibrating"]`` whether this episode holds such moves: it demonstrates
+    nothing then.
 
     Example:
         >>> import gymnasium as gym
@@ -138,6 +185,17 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         guide_patience: after so many steps in which the furthest aligned frame did not advance,
             play on from that frame, one action a step; None: never.
         step_pattern: "symmetric" (Eq. 1) or "strap".
+        register: whether pictures are moved back, once an episode has shown how far the target
+            stands from where it stood in the demonstration, before they are aligned.
+        correction: "none", or "servo": actions are corrected for where the target is
+            (`regil_wrappers.correction`). Needs a fixed camera, an arm that starts in the same pose
+            each time, and actions that are deltas.
+        translation_dims: the three action dimensions that move the hand. These four take what the
+            environment says of itself (``metadata["regil"]``) where they are None, else [0, 1, 2],
+            3, [10, 10, 0.5] and "auto".
+        gripper_dim: the action dimension of the gripper, positive to close; "none" without one.
+        plane: how far targets move along these three, as standard deviations in action units.
+        mirror: +1, or -1 where pictures are mirrored against the action axes, or "auto".
 
     Raises:
         ValueError: if the demonstration does not fit the environment or an argument is out of
@@ -156,8 +214,14 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         guide_offset: int = 0,
         guide_patience: int | None = None,
         step_pattern: StepPattern = "symmetric",
+        register: bool = False,
+        correction: Literal["none", "servo"] = "none",
+        translation_dims: list[int] | None = None,
+        gripper_dim: int | Literal["none"] | None = None,
+        plane: list[float] | None = None,
+        mirror: Literal["auto", 1, -1] | None = None,
     ) -> None:
-        settings = _settings(demo, encoder, k, horizon, image, step_pattern)
+        settings = _settings(demo, encoder, k, horizon, image, step_pattern, register)
         loaded, frames = _checked(env, settings)
         if type(guide_offset) is not int:
             raise ValueError(f"guide_offset={guide_offset!r}: it must be a whole number of frames")
@@ -165,6 +229,8 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
             raise ValueError(
                 f"guide_patience={guide_patience!r}: it must be at least 1 step, or None"
             )
+        if correction not in ("none", "servo"):
+            raise ValueError(f"correction={correction!r}: choose one of ['none', 'servo']")
         self._actions: NDArray[np.float32] = _guide_actions(env, loaded, _label(settings["demo"]))
 
         gym.utils.RecordConstructorArgs.__init__(
@@ -173,6 +239,11 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
             **settings,
             guide_offset=guide_offset,
             guide_patience=guide_patience,
+            correction=correction,
+            translation_dims=translation_dims,
+            gripper_dim=gripper_dim,
+            plane=plane,
+            mirror=mirror,
         )
         _RetrievalWrapper.__init__(self, env, loaded, settings, frames)
 
@@ -180,9 +251,29 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         self.guide_patience = guide_patience
         self._furthest = -1
         self._waiting = 0
+        self._servo: Servo | None = None
+        if correction == "servo":
+            declared = {
+                "translation_dims": translation_dims,
+                "gripper_dim": gripper_dim,
+                "plane": plane,
+                "mirror": mirror,
+            }
+            self._servo = _servo(env, self.retriever.picture_size, self._actions, declared)
 
     def guide_action(self) -> NDArray[np.float32]:
-        """The demonstrator's action here: (A,) float32, in the environment's own units.
+        """What the guide would do now: (A,) float32, in the environment's own units.
+
+        The demonstrator's action, corrected or not.
+
+        Raises:
+            ValueError: before the first reset.
+        """
+        action = self._servo.action() if self._servo is not None else None
+        return self.plain_action() if action is None else action
+
+    def plain_action(self) -> NDArray[np.float32]:
+        """The demonstrator's own action here: (A,) float32, in the environment's own units.
 
         At the end of the demonstration, its last action.
 
@@ -203,7 +294,11 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         """Reset; ``info["retrieval"]`` holds the alignment and the first guide action."""
         observation, info = super().reset(seed=seed, options=options)
         self._furthest, self._waiting = self.alignment.end, 0
-        return observation, self._with_retrieval(info, guide_action=self.guide_action())
+        if self._servo is not None:
+            if seed is not None:
+                self._servo.reseed(seed)
+            self._servo.reset(self.displacement if self._servo.calibrated else None)
+        return observation, self._with_retrieval(info, **self._guidance())
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step with the given action; ``info["retrieval"]`` holds the guide's for the next step."""
@@ -211,16 +306,45 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         advanced = self.alignment.end > self._furthest
         self._furthest = max(self._furthest, self.alignment.end)
         self._waiting = 0 if advanced else self._waiting + 1
-        info = self._with_retrieval(info, guide_action=self.guide_action())
+        if self._servo is not None:
+            self._servo.executed(np.asarray(action, np.float32), self.retrieval_frame)
+            if terminated or truncated:
+                self._servo.finish(bool(info.get("is_success", terminated)))
+        info = self._with_retrieval(info, **self._guidance())
         return observation, reward, terminated, truncated, info
+
+    def _guidance(self) -> dict[str, Any]:
+        action = {"guide_action": self.guide_action()}
+        if self._servo is None:
+            return action
+        return {**action, "guide": self._servo.kind, "calibrating": self._servo.calibrating}
+
+    def calibration(self) -> dict[str, Any] | None:
+        """What a correcting guide has learned about camera and task, as JSON values.
+
+        None before its calibration is over, and without a correction.
+        """
+        return None if self._servo is None else self._servo.state()
+
+    def set_calibration(self, calibration: dict[str, Any]) -> None:
+        """Take over another guide's calibration: same demonstration, same camera.
+
+        Raises:
+            ValueError: if it is not one, or from pictures of another size.
+        """
+        if self._servo is None:
+            raise ValueError("a guide without correction takes no calibration")
+        self._servo.load_state(calibration)
 
 
 class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
-    """Rewards following the demonstration: r = -(S-DTW cost) / (frames in the window), Eq. 3.
+    """Rewards following the demonstration.
 
-    The reward is 0 along an exact replay and negative otherwise, and depends on nothing that comes
-    later. Observations pass through. ``info["retrieval"]`` holds ``start``, ``end`` (frames of the
-    demonstration), ``cost`` and ``env_reward``, the environment's own.
+    "sdtw", the paper's: r = -(S-DTW cost) / (frames in the window), Eq. 3: 0 along an exact replay
+    and negative otherwise. "progress": r = max_j phi_j exp(-C(j) / tau) - 1, in (-1, 0], which
+    rises along the demonstration (`regil_wrappers.rewards.progress_reward`). Both depend on nothing
+    that comes later. Observations pass through. ``info["retrieval"]`` holds ``start``, ``end``
+    (frames of the demonstration), ``cost`` and ``env_reward``, the environment's own.
 
     Example:
         >>> import gymnasium as gym
@@ -242,12 +366,14 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
         horizon: H, how many frames before the current one are aligned with it.
         image: where frames come from: "obs" (the observation is the picture), "obs:KEY" (a key of a
             dict observation) or "render" (``env.render()``, with ``render_mode="rgb_array"``).
-        reward: "sdtw".
+        reward: "sdtw" or "progress".
         mode: "replace" the environment's reward, or "add" to it.
         weight: factor of this reward.
         divisor: "window" divides by the frames in the window, "horizon" always by H + 1 as the
             paper does; they differ in the first H steps of an episode.
         step_pattern: "symmetric" (Eq. 1) or "strap".
+        register: whether pictures are moved back, once an episode has shown how far the target
+            stands from where it stood in the demonstration, before they are aligned.
 
     Raises:
         ValueError: if the demonstration does not fit the environment or an argument is out of
@@ -263,13 +389,14 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
         k: int = 5,
         horizon: int = 4,
         image: str = "obs",
-        reward: Literal["sdtw"] = "sdtw",
+        reward: Literal["sdtw", "progress"] = "sdtw",
         mode: Literal["replace", "add"] = "replace",
         weight: float = 1.0,
         divisor: Literal["window", "horizon"] = "window",
         step_pattern: StepPattern = "symmetric",
+        register: bool = False,
     ) -> None:
-        settings = _settings(demo, encoder, k, horizon, image, step_pattern)
+        settings = _settings(demo, encoder, k, horizon, image, step_pattern, register)
         loaded, frames = _checked(env, settings)
         for name, value, choices in (
             ("reward", reward, _REWARDS),
@@ -294,16 +421,30 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
 
         self.mode = mode
         self.weight = weight
+        self.reward = reward
         self._divided_by_horizon = horizon if divisor == "horizon" else None
 
     @cached_property
     def reward_scale(self) -> float:
-        """The reward's own scale: 1 / tau of the demonstration (`rewards.demonstration_tau`).
+        """The reward's own scale: 1 / tau of the demonstration for "sdtw", 1 for "progress".
 
         Raises:
             ValueError: if the demonstration does not move.
         """
-        return 1 / demonstration_tau(self.retriever.embeddings)
+        return 1 / self._tau if self.reward == "sdtw" else 1.0
+
+    @cached_property
+    def _tau(self) -> float:
+        return demonstration_tau(self.retriever.embeddings)
+
+    @cached_property
+    def _phi(self) -> NDArray[np.float64]:
+        return arc_length(self.retriever.embeddings)
+
+    def _retrieval_reward(self) -> float:
+        if self.reward == "sdtw":
+            return sdtw_reward(self.alignment, self._divided_by_horizon)
+        return progress_reward(self.retriever.end_costs(), self._phi, self._tau)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -315,7 +456,7 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step; the environment's own reward goes to ``info["retrieval"]["env_reward"]``."""
         observation, env_reward, terminated, truncated, info = super().step(action)
-        reward = self.weight * sdtw_reward(self.alignment, self._divided_by_horizon)
+        reward = self.weight * self._retrieval_reward()
         if self.mode == "add":
             reward += float(env_reward)
         info = self._with_retrieval(info, env_reward=float(env_reward))
@@ -329,6 +470,7 @@ def _settings(
     horizon: int,
     image: str,
     step_pattern: str,
+    register: bool,
 ) -> dict[str, Any]:
     """The arguments that decide an alignment, as a specification can hold them."""
     return {
@@ -338,6 +480,7 @@ def _settings(
         "horizon": horizon,
         "image": image,
         "step_pattern": step_pattern,
+        "register": register,
     }
 
 
@@ -365,6 +508,8 @@ def _checked(
         return env.get_wrapper_attr("demonstration"), None
     if not isinstance(demo, Demonstration):
         demo = Demonstration.load(demo)
+    if not isinstance(settings["register"], bool):
+        raise ValueError(f"register={settings['register']!r}: it must be True or False")
     check_settings(demo, settings["k"], settings["horizon"], settings["step_pattern"], label)
     encoder = settings["encoder"]
     if not isinstance(encoder, str) and not hasattr(encoder, "encode"):
@@ -404,3 +549,30 @@ def _guide_actions(env: gym.Env[Any, Any], demo: Demonstration, label: str) -> N
             f"environment takes [{low[a]:g}, {high[a]:g}]: record it in this environment"
         )
     return demo.actions
+
+
+_DECLARED = {
+    "translation_dims": [0, 1, 2],
+    "gripper_dim": 3,
+    "plane": [10.0, 10.0, 0.5],
+    "mirror": "auto",
+}
+
+
+def _servo(
+    env: gym.Env[Any, Any],
+    size: tuple[int, int],
+    actions: NDArray[np.float32],
+    declared: dict[str, Any],
+) -> Servo:
+    """A correction with what the user declared, else what the environment says, else defaults."""
+    said = env.unwrapped.metadata.get("regil") or {}
+    chosen = {
+        name: value if value is not None else said.get(name, _DECLARED[name])
+        for name, value in declared.items()
+    }
+    if chosen["gripper_dim"] == "none":
+        chosen["gripper_dim"] = None
+    space = cast("gym.spaces.Box", env.action_space)
+    low, high = space.low.astype(np.float32), space.high.astype(np.float32)
+    return Servo(size, actions, low, high, control_rate=said.get("control_rate"), **chosen)

@@ -1,0 +1,465 @@
+"""A demonstration's actions, corrected for where the target is now.
+
+* ``Servo`` - moves the hand a little to learn how the camera sees it, then, in each episode, looks
+  at the first picture, finds how far the target stands from where it stood, and replays the
+  demonstrated path shifted by that much
+
+It is given pictures and says actions. It assumes a fixed camera, an arm that starts each episode in
+the same pose, translations that are deltas, and one target that moved.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, Literal, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from regil_wrappers.pinhole import Pinhole, fit_pinhole, nearest_to_path, solve_displacement
+from regil_wrappers.registration import Displacement, local_shift
+
+__all__ = ["Servo"]
+
+Picture = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+Mirror = Literal["auto", 1, -1]
+
+_RAMP = 0.15  # of the demonstration: the share in which the correction grows to its full size
+_REACHED = 0.3  # of a full action: a place of the path counts as reached
+_SETTLE = 0.1  # s that a calibration move is given to come to rest
+_RELEASE = (10, 12)  # steps after the gripper closes: the correction starts to fade; fades over
+_WORST_RATIO = 0.95  # a registration that explains less is not believed
+_FARTHEST = 3.5  # displacements beyond this many times the plane's largest std are not believed
+_STILL = 0.5  # px at 84 pixels: a pair of calibration pictures that shifted less says nothing
+
+# Successes and failures that each way of replaying starts with, Beta(a, b): what is usually best is
+# tried first, and given up when it fails.
+_PRIORS = {"corrected": (4.0, 1.0), "released": (2.0, 1.0), "plain": (1.0, 1.5)}
+
+
+@dataclass
+class _Way:
+    """One way of replaying, and what came of it."""
+
+    kind: str  # "corrected", "released" or "plain"
+    mirror: int
+    won: float
+    lost: float
+
+
+@dataclass
+class _Segment:
+    """Calibration moves that belong together: done within one episode, or again."""
+
+    actions: list[NDArray[np.float32]]
+    marks: list[int]  # after how many actions a picture is kept; 0 is before the first
+    places: Floats  # (marks, 3): where the hand is then
+    pictures: list[Picture] = field(default_factory=list)
+
+
+class Servo:
+    """Replays a demonstration where the target is now, from pictures alone.
+
+    Call `reset` when an episode begins, then ask `action` and tell what was done with `executed`,
+    until `finish`. The first calls of `action` are calibration moves, along whole axes, as many as
+    fit into an episode; from then on `reset` is told what has moved since the demonstration began.
+
+    Args:
+        size: (height, width) px of the pictures.
+        actions: (T, A) float32, the demonstration's.
+        low: (A,) least actions.
+        high: (A,) largest actions.
+        translation_dims: the three dimensions that move the hand, as deltas.
+        gripper_dim: the dimension of the gripper, positive to close; None without one.
+        plane: (3,) how far targets move along each of these, as standard deviations in action
+            units; also the scale of the scene.
+        mirror: +1, or -1 where the picture is mirrored against the action axes, or "auto": both are
+            tried, and successes decide.
+        control_rate: actions a second, for how long moves take to come to rest.
+        seed: of the choice between ways of replaying.
+
+    Raises:
+        ValueError: if a dimension does not exist or cannot be a delta.
+    """
+
+    def __init__(
+        self,
+        size: tuple[int, int],
+        actions: NDArray[np.float32],
+        low: NDArray[np.float32],
+        high: NDArray[np.float32],
+        translation_dims: Iterable[int] = (0, 1, 2),
+        gripper_dim: int | None = 3,
+        plane: Iterable[float] = (10.0, 10.0, 0.5),
+        mirror: Mirror = "auto",
+        control_rate: float | None = None,
+        seed: int | None = None,
+    ) -> None:
+        self._dims = _checked_dims(list(translation_dims), low, high)
+        self._plane = np.array(list(plane), float)
+        if self._plane.shape != (3,) or not (self._plane > 0).all():
+            raise ValueError(
+                f"plane={list(plane)}: give three positive standard deviations, in action units"
+            )
+        if gripper_dim is not None and not (
+            0 <= gripper_dim < len(low) and gripper_dim not in self._dims
+        ):
+            raise ValueError(
+                f"gripper_dim={gripper_dim}: it must be a dimension of the actions that is not "
+                f"one of translation_dims={self._dims}"
+            )
+        if mirror not in ("auto", 1, -1):
+            raise ValueError(f"mirror={mirror!r}: choose 'auto', 1 or -1")
+        self._size = size
+        self._unit = min(size) / 84
+        self._actions = actions
+        self._gripper = gripper_dim
+        self._limit = np.minimum(-low, high)[self._dims].astype(float)
+        deltas = np.clip(actions[:, self._dims].astype(float), -self._limit, self._limit)
+        self._path = np.cumsum(deltas, axis=0)
+        self._last_delta = deltas[-1]
+        self._mirrors = (1, -1) if mirror == "auto" else (mirror,)
+        self._rng = np.random.default_rng(seed)
+        self._length = float(self._plane.max())
+        self._settle = max(2, math.ceil(_SETTLE * (control_rate or 40.0)))
+        self._low, self._high = low, high
+
+        self._segments = self._plan()
+        self._done: list[_Segment] = []
+        self.cameras: dict[int, Pinhole] = {}
+        self._ways = self._all_ways()
+        self.why = ""  # why replay is plain, where it is
+        self._begin_episode()
+
+    # -- what the guide calls --------------------------------------------------------------------
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether calibration is over, so that `reset` can use a displacement."""
+        return not self._segments
+
+    # Of an episode
+    target_shift: Floats  # action units: where the target is believed to have gone
+    _way: _Way
+    _segment: _Segment | None  # calibration moves under way
+    _step: int  # of them
+    _wait: int  # steps to rest before them
+    _calibrated_here: bool
+    _followed: bool  # whether every action was the guide's
+    _at: int  # the place of the path that the hand is on its way to
+    _hand: Floats  # (3,) action units from the start
+
+    def reset(self, displacement: Displacement | None = None) -> None:
+        """Begin an episode.
+
+        Args:
+            displacement: what `registration.register` found between the demonstration's first
+                picture and this episode's; not used before `calibrated`.
+        """
+        self._begin_episode()
+        if self._segments:
+            self._segment = self._segments[0]
+            self._segment.pictures = []
+            self._wait = self._settle + 2  # the gripper may have to open or close first
+        else:
+            self._begin_replay(displacement)
+
+    def reseed(self, seed: int) -> None:
+        """Seed the choice between ways of replaying."""
+        self._rng = np.random.default_rng(seed)
+
+    @property
+    def calibrating(self) -> bool:
+        """Whether this episode holds calibration moves: it demonstrates nothing."""
+        return self._calibrated_here
+
+    @property
+    def kind(self) -> str:
+        """What `action` is now: "calibration", "corrected", "released" or "plain"."""
+        return "calibration" if self._segment is not None else self._way.kind
+
+    def action(self) -> NDArray[np.float32] | None:
+        """What to do now: (A,) float32; None for the demonstration's own, unchanged."""
+        if self._segment is not None:
+            if self._wait:
+                return self._idle()
+            return self._segment.actions[self._step]
+        if self._way.kind == "plain":
+            return None
+        action = self._actions[min(self._at, len(self._actions) - 1)].copy()
+        action[self._dims] = np.clip(self._target() - self._hand, -self._limit, self._limit)
+        clipped: NDArray[np.float32] = np.clip(action, self._low, self._high)
+        return clipped
+
+    def executed(self, action: NDArray[np.float32], picture: Picture) -> None:
+        """What was done, whoever chose it, and the picture that followed."""
+        suggested = self.action()
+        followed = suggested is None or np.allclose(action, suggested, atol=1e-4)
+        self._followed = self._followed and bool(followed)
+        if self._segment is not None:
+            self._calibrated_here = True
+            if not followed:  # somebody else acts: no calibration in this episode
+                self._segment, self._way = None, self._plain()
+                return
+            self._calibration_step(self._segment, picture)
+            return
+        if self._way.kind != "plain":
+            target = self._target()
+            delta = np.asarray(action, float)[self._dims]
+            self._hand = self._hand + np.clip(delta, -self._limit, self._limit)
+            if (np.abs(target - self._hand) <= _REACHED * self._limit).all():
+                self._at += 1
+
+    def finish(self, success: bool) -> None:
+        """The episode is over; what came of it counts where the guide chose every action."""
+        if self._segment is None and self._followed and not self._calibrated_here:
+            if success:
+                self._way.won += 1
+            else:
+                self._way.lost += 1
+        self._followed = False  # once
+
+    def state(self) -> dict[str, Any] | None:
+        """What calibration found and which ways succeeded, as JSON values; None before that."""
+        if self._segments:
+            return None
+        return {
+            "cameras": [camera.as_dict() for camera in self.cameras.values()],
+            "ways": [[w.kind, w.mirror, w.won, w.lost] for w in self._ways],
+            "why": self.why,
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what `state` gave, from a guide with the same demonstration and camera.
+
+        Raises:
+            ValueError: if it is not such a state, or from pictures of another size.
+        """
+        try:
+            cameras = [Pinhole.from_dict(values) for values in state["cameras"]]
+            ways = [_Way(str(k), int(m), float(w), float(n)) for k, m, w, n in state["ways"]]
+            why = str(state["why"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"not the state of a calibrated guide: {error}") from error
+        height, width = self._size
+        if any(camera.size != self._size for camera in cameras):
+            raise ValueError(f"the calibration is not from pictures of {height}x{width}")
+        mirrors = {camera.mirror for camera in cameras}
+        if "plain" not in {way.kind for way in ways} or not all(
+            way.kind == "plain" or way.mirror in mirrors for way in ways
+        ):
+            raise ValueError("not the state of a calibrated guide: ways and cameras do not fit")
+        self.cameras = {camera.mirror: camera for camera in cameras}
+        self._ways, self.why = ways, why
+        self._segments = []
+        self._begin_episode()
+
+    # -- replaying -------------------------------------------------------------------------------
+
+    def _begin_replay(self, found: Displacement | None) -> None:
+        self._way = self._chosen()
+        if self._way.kind == "plain" or found is None or found.ratio > _WORST_RATIO:
+            return
+        camera = self.cameras[self._way.mirror]
+        place = nearest_to_path(camera, found.point, self._path)
+        shift = solve_displacement(camera, place, found.shift, found.growth, self._plane)
+        if np.linalg.norm(shift) <= _FARTHEST * self._length:
+            self.target_shift = shift
+
+    def _chosen(self) -> _Way:
+        """Thompson sampling on the successes seen."""
+        draws = [self._rng.beta(way.won, way.lost) for way in self._ways]
+        return self._ways[int(np.argmax(draws))]
+
+    def _all_ways(self) -> list[_Way]:
+        ways = []
+        for mirror in self.cameras:
+            for kind in ("corrected", "released"):
+                if kind == "corrected" or self._grasp() is not None:
+                    ways.append(_Way(kind, mirror, *_PRIORS[kind]))
+        return [*ways, _Way("plain", 1, *_PRIORS["plain"])]
+
+    def _plain(self) -> _Way:
+        return next(way for way in self._ways if way.kind == "plain")
+
+    def _grasp(self) -> int | None:
+        """The step in which an open gripper closes; None where none does."""
+        if self._gripper is None:
+            return None
+        closing = self._actions[:, self._gripper] > 0
+        events = np.flatnonzero(closing[1:] & ~closing[:-1])
+        return int(events[0]) + 1 if len(events) else None
+
+    def _begin_episode(self) -> None:
+        self._segment = None
+        self._step = self._wait = 0
+        self._calibrated_here = False
+        self._followed = True
+        self._at = 0
+        self._hand = np.zeros(3)
+        self._way = self._plain()
+        self.target_shift = np.zeros(3)
+
+    def corrected_path(self) -> Floats:
+        """(T, 3) action units: the places that this episode's replay goes through."""
+        return np.stack([self._place(i) for i in range(len(self._path))])
+
+    def _target(self) -> Floats:
+        return self._place(self._at)
+
+    def _place(self, i: int) -> Floats:
+        n = len(self._path)
+        beyond = max(0, i - n + 1)  # the last action goes on
+        weight = min(1.0, (i + 1) / (_RAMP * n))
+        grasp = self._grasp()
+        if self._way.kind == "released" and grasp is not None:
+            weight *= float(np.clip(1 - (i - grasp - _RELEASE[0]) / _RELEASE[1], 0, 1))
+        place = self._path[min(i, n - 1)] + beyond * self._last_delta
+        return cast("Floats", place + weight * self.target_shift)
+
+    # -- calibration -----------------------------------------------------------------------------
+
+    def _held(self) -> float:
+        """How the gripper is held: as the demonstration begins, or open."""
+        assert self._gripper is not None
+        first = float(self._actions[0, self._gripper])
+        return first if abs(first) > 0.5 else float(self._low[self._gripper])
+
+    def _idle(self, gripper: float | None = None) -> NDArray[np.float32]:
+        action = np.zeros(self._actions.shape[1], np.float32)
+        if self._gripper is not None:
+            action[self._gripper] = self._held() if gripper is None else gripper
+        return action
+
+    def _plan(self) -> list[_Segment]:
+        segments = []
+        if self._gripper is not None:
+            other = self._low + self._high
+            turned = self._idle(float(other[self._gripper]) - self._held())
+            actions = [turned] * self._settle + [self._idle()] * self._settle
+            marks = [0, self._settle, 2 * self._settle]
+            segments.append(_Segment(actions, marks, np.zeros((3, 3))))
+        for axis, dim in enumerate(self._dims):
+            actions, marks, places = [], [0], [np.zeros(3)]
+            for goal in (1.0, 0.0, -1.0, 0.0):
+                place = np.zeros(3)
+                place[axis] = goal * self._length / 2
+                way = place[axis] - places[-1][axis]
+                while abs(way) > 1e-9:
+                    part = float(np.clip(way, -self._limit[axis], self._limit[axis]))
+                    action = self._idle()
+                    action[dim] = part
+                    actions.append(action)
+                    way -= part
+                actions += [self._idle()] * self._settle
+                marks.append(len(actions))
+                places.append(place)
+            segments.append(_Segment(actions, marks, np.stack(places)))
+        return segments
+
+    def _calibration_step(self, segment: _Segment, picture: Picture) -> None:
+        if self._wait:
+            self._wait -= 1
+        else:
+            self._step += 1
+        if self._wait == 0 and self._step in segment.marks:
+            segment.pictures.append(picture.copy())
+        if self._step < len(segment.actions):
+            return
+        self._done.append(segment)
+        self._segments.pop(0)
+        self._step = 0
+        self._segment = self._segments[0] if self._segments else None
+        if self._segment is not None:
+            self._segment.pictures = [picture.copy()]
+            return
+        self._calibrate()
+        self._done = []
+        self._way = self._plain()  # what is left of this episode
+
+    def _calibrate(self) -> None:
+        moves = [segment for segment in self._done if segment.places.any()]
+        hand = _moves_most([segment.pictures for segment in moves])
+        gripper = [segment for segment in self._done if not segment.places.any()]
+        if gripper:
+            tool = _tool_pixel(gripper[0].pictures, hand, self._unit)
+            hand = hand if tool is None else tool
+        before, after, shifts = [], [], []
+        for segment, dim in zip(moves, self._dims, strict=True):
+            shifted = np.stack([local_shift(a, b, hand) for a, b in pairwise(segment.pictures)])
+            seen = np.linalg.norm(shifted, axis=1) > _STILL * self._unit
+            if not seen.any():
+                self.why = (
+                    f"translation_dims: action dimension {dim} does not move the hand's picture: "
+                    "it must be a delta that moves it"
+                )
+            before.append(segment.places[:-1][seen])
+            after.append(segment.places[1:][seen])
+            shifts.append(shifted[seen])
+        if self.why:
+            warnings.warn(f"{self.why}; the guide replays without correction", stacklevel=2)
+            return
+        for mirror in self._mirrors:
+            self.cameras[mirror] = fit_pinhole(
+                np.concatenate(before),
+                np.concatenate(after),
+                np.concatenate(shifts),
+                hand,
+                self._size,
+                mirror,
+                self._length,
+            )
+        # The better fit is tried first
+        self.cameras = dict(sorted(self.cameras.items(), key=lambda item: item[1].cost))
+        self._ways = self._all_ways()
+
+
+def _checked_dims(
+    dims: list[int], low: NDArray[np.float32], high: NDArray[np.float32]
+) -> list[int]:
+    if len(dims) != 3 or len(set(dims)) != 3 or not all(0 <= d < len(low) for d in dims):
+        raise ValueError(
+            f"translation_dims={dims}: name the three action dimensions (0 to {len(low) - 1}) "
+            "that move the hand"
+        )
+    for d in dims:
+        if not low[d] < 0 < high[d]:
+            raise ValueError(
+                f"translation_dims={dims}: dimension {d} takes [{low[d]:g}, {high[d]:g}], which "
+                "cannot be a delta: correction='servo' needs deltas"
+            )
+    return dims
+
+
+def _moves_most(pictures: list[list[Picture]]) -> Floats:
+    """Centroid (x, y) of the pixels that change most within sequences of pictures."""
+    change = sum(
+        cv2.GaussianBlur(np.abs(b.astype(np.float32) - a).max(axis=2), (0, 0), 2.0)
+        for sequence in pictures
+        for a, b in pairwise(sequence)
+    )
+    assert isinstance(change, np.ndarray)
+    _, labels = cv2.connectedComponents((change > 0.6 * change.max()).astype(np.uint8))
+    there = labels == labels[np.unravel_index(change.argmax(), change.shape)]
+    return _centroid(change * there)
+
+
+def _tool_pixel(pictures: list[Picture], near: Floats, unit: float) -> Floats | None:
+    """Centroid of what changes when only the gripper moves; None where too little does."""
+    still, turned, back = (p.astype(np.float32) for p in pictures)
+    change = np.abs(turned - still).max(axis=2) + np.abs(back - turned).max(axis=2)
+    y, x = np.mgrid[: change.shape[0], : change.shape[1]]
+    change = change * (np.hypot(x - near[0], y - near[1]) < 25 * unit)
+    much = (change > max(25.0, 0.3 * change.max())) & (change > 0)
+    return _centroid(change * much) if much.sum() >= 3 * unit**2 else None
+
+
+def _centroid(weights: NDArray[Any]) -> Floats:
+    y, x = np.mgrid[: weights.shape[0], : weights.shape[1]]
+    return np.array([(x * weights).sum(), (y * weights).sum()]) / max(float(weights.sum()), 1e-9)

@@ -1,0 +1,371 @@
+"""Two pictures of one scene: how far what differs has moved, and how much it has grown.
+
+* ``Displacement`` - the answer
+* ``register`` - finds it: what stood at p in one picture stands at centre + shift + growth * (p -
+  centre) in the other
+* ``local_shift`` - the shift of what stands round one point, for pictures that follow each other
+* ``moved_back`` - a picture warped so that what moved stands where it stood
+* ``match_colours`` - takes a change of brightness or colour out
+
+Points are (x, y) in pixels, x to the right and y down. Lengths below that are given "at 84 pixels"
+grow with the shorter side of the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Displacement", "local_shift", "match_colours", "moved_back", "register"]
+
+Picture = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+Point = NDArray[np.float64]
+
+_DIFFERENT = 25.0  # of 255: a pixel that differs by more in some channel has changed
+_TRUNCATION = 76.5  # of 255: an error counts no more than this, so that what is hidden costs little
+_SMALLEST = 12  # changed pixels at 84 pixels; fewer: nothing has moved
+_SPECK = 4  # connected changed pixels at 84 pixels; fewer are noise
+_HULL_WEIGHT = 0.2  # of the unchanged pixels between changed ones
+_COARSE = 42  # side of the pictures of the coarse search
+_REACH = 14  # how far it looks, in pixels of these
+_PULL = 0.51  # error (of 255) that a pixel of coarse shift must save
+_GROWTHS = (0.88, 1.0, 1.12)
+_MOST_GROWTH = (0.75, 1.35)
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """What moved between two pictures.
+
+    Attributes:
+        point: (x, y) px, where it stood in the first picture.
+        shift: (x, y) px, from there to where it stands in the second.
+        growth: its size in the second picture over that in the first.
+        ratio: error left after moving it back, over the error before; near 0 is a good match, and
+            near 1 no match at all.
+    """
+
+    point: tuple[float, float]
+    shift: tuple[float, float]
+    growth: float
+    ratio: float
+
+
+def match_colours(reference: Picture, picture: Picture) -> Floats:
+    """Gain and offset of each channel fitted robustly, and applied.
+
+    Args:
+        reference: (H, W, 3) uint8.
+        picture: (H, W, 3) uint8, mostly the same scene.
+
+    Returns:
+        (H, W, 3) float32 in [0, 255]: the picture in the reference's brightness and colours.
+    """
+    matched = picture.astype(np.float32)
+    for channel in range(3):
+        x = matched[..., channel].ravel()
+        y = reference[..., channel].astype(np.float32).ravel()
+        gain, offset = 1.0, 0.0
+        for threshold in (60.0, 25.0, 25.0):
+            same = np.abs(gain * x + offset - y) < threshold
+            if same.mean() < 0.07 or x[same].std() < 3:
+                break
+            gain, offset = np.polyfit(x[same], y[same], 1)
+        matched[..., channel] = np.clip(gain * x + offset, 0, 255).reshape(picture.shape[:2])
+    return matched
+
+
+def register(reference: Picture, picture: Picture) -> Displacement | None:
+    """What moved from one picture to the other, and how far.
+
+    Pixels that differ are taken, and the shift and growth sought that make both pictures agree on
+    them, both ways: first on a grid over small pictures, then below a pixel on the pixels that the
+    grid's answer explains. One rigid thing is assumed to have moved; the rest stands still.
+
+    Args:
+        reference: (H, W, 3) uint8, the first picture.
+        picture: (H, W, 3) uint8, the second, from the same camera.
+
+    Returns:
+        the displacement, or None where nothing has moved.
+
+    Raises:
+        ValueError: if the pictures differ in shape or are not uint8 (H, W, 3).
+    """
+    _check(reference, picture)
+    a, b = reference.astype(np.float32), match_colours(reference, picture)
+    unit = min(a.shape[:2]) / 84
+    found = _changed(a, b, unit)
+    if found is None:
+        return None
+    changed, hull = found
+    weights = np.maximum(cv2.dilate(changed, _square(3, unit)), hull * _HULL_WEIGHT)
+    shift, growth = _coarse(a, b, weights, unit)
+
+    ys, xs = np.nonzero(hull)
+    centre = np.array([xs.min() + xs.max(), ys.min() + ys.max()]) / 2
+    smooth_a, smooth_b = _blurred(a, 0.8 * unit), _blurred(b, 0.8 * unit)
+    before, after = weights, weights
+    seen = changed
+    for _ in range(3):
+        shift, growth = _refine(smooth_a, smooth_b, before, after, centre, shift, growth, unit)
+        there, here = _both_ways(a, b, centre, shift, growth)
+        explained = [
+            changed * (np.abs(x - y).mean(axis=2) < _DIFFERENT) for x, y in ((there, a), (here, b))
+        ]
+        if min(x.sum() for x in explained) < 8 * unit**2:
+            break
+        seen = explained[0]
+        before, after = (
+            cv2.morphologyEx(
+                cv2.dilate(x, _square(3, unit)), cv2.MORPH_CLOSE, _square(5, unit)
+            ).astype(np.float32)
+            for x in explained
+        )
+    left = _error(a, b, weights, weights, centre, shift, growth)
+    still = _error(a, b, weights, weights, centre, np.zeros(2), 1.0)
+    ys, xs = np.nonzero(seen)
+    point = np.array([xs.mean(), ys.mean()])
+    moved = centre + shift + growth * (point - centre) - point
+    return Displacement(
+        point=(float(point[0]), float(point[1])),
+        shift=(float(moved[0]), float(moved[1])),
+        growth=float(growth),
+        ratio=left / max(still, 1e-9),
+    )
+
+
+def moved_back(picture: Picture, displacement: Displacement | None) -> Picture:
+    """The picture shifted so that what moved stands where it stood; growth is left alone.
+
+    Args:
+        picture: (H, W, 3) uint8, like the second picture of `register`.
+        displacement: what `register` found; None changes nothing.
+
+    Returns:
+        (H, W, 3) uint8; the border repeats.
+    """
+    if displacement is None:
+        return picture
+    x, y = displacement.shift
+    return _warped(picture, np.array([[1, 0, x], [0, 1, y]]), inverse=True)
+
+
+def local_shift(before: Picture, after: Picture, point: Point, radius: float = 8.0) -> Point:
+    """How far what stands round a point has moved between two pictures that follow each other.
+
+    Args:
+        before: (H, W, 3) uint8.
+        after: (H, W, 3) uint8.
+        point: (2,) px (x, y), midway between where it stood and where it stands.
+        radius: std of the Gaussian weights round the point, px at 84 pixels.
+
+    Returns:
+        (2,) px; 0 where nothing changed near the point.
+
+    Raises:
+        ValueError: if the pictures differ in shape or are not uint8 (H, W, 3).
+    """
+    _check(before, after)
+    a, b = before.astype(np.float32), after.astype(np.float32)
+    unit = min(a.shape[:2]) / 84
+    changed = (np.abs(a - b).max(axis=2) > _DIFFERENT).astype(np.uint8)
+    weights = cv2.dilate(changed, _square(3, unit)) * _gaussian(a, point, radius * unit)
+    if weights.sum() < 3 * unit**2:
+        return np.zeros(2)
+    a, b = _blurred(a, unit), _blurred(b, unit)
+
+    def error(shift: Point) -> float:
+        return _error(a, b, weights, weights, point, shift, 1.0, truncation=60.0)
+
+    grid = np.arange(-8, 9, 2) * unit
+    shift = min((np.array([x, y]) for y in grid for x in grid), key=error)
+    least = error(shift)
+    for step in (1.0, 0.5, 0.25, 0.12, 0.06):
+        for _ in range(6):
+            near = [shift + step * unit * np.array(d) for d in _EIGHT]
+            errors = [error(x) for x in near]
+            best = int(np.argmin(errors))
+            if errors[best] >= least - 1e-6:
+                break
+            least, shift = errors[best], near[best]
+    return shift
+
+
+_FOUR = ((1, 0), (-1, 0), (0, 1), (0, -1))
+_EIGHT = (*_FOUR, (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+def _check(a: Picture, b: Picture) -> None:
+    for x in (a, b):
+        if x.dtype != np.uint8 or x.ndim != 3 or x.shape[2] != 3 or x.shape != a.shape:
+            raise ValueError(
+                f"pictures are {a.dtype} {a.shape} and {b.dtype} {b.shape}: give two of one shape, "
+                f"uint8 (H, W, 3)"
+            )
+
+
+def _blurred(picture: Floats, std: float) -> Floats:
+    return cast("Floats", cv2.GaussianBlur(picture, (0, 0), std))
+
+
+def _square(side: float, unit: float) -> NDArray[np.uint8]:
+    n = max(1, round(side * unit)) | 1
+    return np.ones((n, n), np.uint8)
+
+
+def _gaussian(picture: Floats, point: Point, radius: float) -> Floats:
+    y, x = np.mgrid[: picture.shape[0], : picture.shape[1]]
+    squared = (x - point[0]) ** 2 + (y - point[1]) ** 2
+    weights: Floats = np.exp(-squared / (2 * radius**2)).astype(np.float32)
+    return weights
+
+
+def _changed(a: Floats, b: Floats, unit: float) -> tuple[Floats, Floats] | None:
+    """Pixels that differ, and their convex hull, a little larger; None where too few do."""
+    changed = (np.abs(a - b).max(axis=2) > _DIFFERENT).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
+    small = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] < _SPECK * unit**2)
+    changed[np.isin(labels, small)] = 0
+    if changed.sum() < _SMALLEST * unit**2:
+        return None
+    hull = np.zeros_like(changed)
+    points = cast("NDArray[np.int32]", cv2.findNonZero(changed))
+    cv2.fillConvexPoly(hull, cv2.convexHull(points), (1,))
+    return changed.astype(np.float32), cv2.dilate(hull, _square(5, unit)).astype(np.float32)
+
+
+def _matrix(centre: Point, shift: Point, growth: float) -> NDArray[np.float64]:
+    offset = centre + shift - growth * centre
+    return np.array([[growth, 0, offset[0]], [0, growth, offset[1]]])
+
+
+def _warped(picture: NDArray[Any], matrix: NDArray[np.float64], inverse: bool) -> NDArray[Any]:
+    flags = cv2.INTER_LINEAR | (cv2.WARP_INVERSE_MAP if inverse else 0)
+    size = (picture.shape[1], picture.shape[0])
+    return cast(
+        "NDArray[Any]",
+        cv2.warpAffine(picture, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE),
+    )
+
+
+def _both_ways(
+    a: Floats, b: Floats, centre: Point, shift: Point, growth: float
+) -> tuple[Floats, Floats]:
+    """The second picture moved back, and the first moved forward."""
+    matrix = _matrix(centre, shift, growth)
+    return _warped(b, matrix, inverse=True), _warped(a, matrix, inverse=False)
+
+
+def _truncated(a: Floats, b: Floats, weights: Floats, truncation: float) -> float:
+    e = cv2.transform(cv2.absdiff(a, b), _MEAN)
+    np.minimum(e, truncation, out=e)
+    return float(cv2.multiply(e, weights).sum() / max(float(weights.sum()), 1e-6))
+
+
+_MEAN = np.full((1, 3), 1 / 3, np.float32)
+
+
+def _error(
+    a: Floats,
+    b: Floats,
+    before: Floats,
+    after: Floats,
+    centre: Point,
+    shift: Point,
+    growth: float,
+    truncation: float = _TRUNCATION,
+) -> float:
+    """Mean truncated difference of the pictures, on weighted pixels of the first and second."""
+    back, forward = _both_ways(a, b, centre, shift, growth)
+    return _truncated(back, a, before, truncation) + _truncated(forward, b, after, truncation)
+
+
+def _coarse(a: Floats, b: Floats, weights: Floats, unit: float) -> tuple[Point, float]:
+    """The best shift (px of the pictures) and growth on a grid, from small pictures."""
+    size = (round(a.shape[1] / unit / 84 * _COARSE), round(a.shape[0] / unit / 84 * _COARSE))
+    a, b, weights = (_shrunk(x, size) for x in (a, b, weights))
+    ys, xs = np.nonzero(weights)
+    rows, columns = slice(ys.min(), ys.max() + 1), slice(xs.min(), xs.max() + 1)
+    centre = np.array([xs.min() + xs.max(), ys.min() + ys.max()]) / 2
+    w = weights[rows, columns]
+    w = w / w.sum()
+    pad = _REACH + 3
+    shifts = np.arange(-_REACH, _REACH + 1)
+    best = (np.inf, np.zeros(2), 1.0)
+    for growth in _GROWTHS:
+        there, here = (_padded(x, pad) for x in _both_ways(a, b, centre, np.zeros(2), growth))
+        # In the second picture moved back, a shift is divided by the growth.
+        back = np.clip(np.round(shifts / growth).astype(int), -pad, pad)
+        for dy, back_y in zip(shifts, back, strict=True):
+            total = _row_errors(there, a[rows, columns], w, rows, columns, pad, back_y, back)
+            total += _row_errors(here, b[rows, columns], w, rows, columns, pad, -dy, -shifts)
+            total += _PULL * np.hypot(shifts, dy) + 2 * abs(np.log(growth))
+            i = int(total.argmin())
+            if total[i] < best[0]:
+                best = (float(total[i]), np.array([shifts[i], dy], float), growth)
+    return best[1] * unit * 84 / _COARSE, best[2]
+
+
+def _shrunk(picture: Floats, size: tuple[int, int]) -> Floats:
+    return cast("Floats", cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+
+
+def _padded(picture: Floats, pad: int) -> Floats:
+    padded = cv2.copyMakeBorder(picture, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
+    return cast("Floats", padded)
+
+
+def _row_errors(
+    padded: Floats,
+    patch: Floats,
+    weights: Floats,
+    rows: slice,
+    columns: slice,
+    pad: int,
+    dy: int,
+    dxs: NDArray[np.int_],
+) -> NDArray[np.float64]:
+    """Weighted truncated errors of a patch against a padded picture, for one dy and every dx."""
+    band = padded[pad + dy + rows.start : pad + dy + rows.stop]
+    windows = np.stack([band[:, pad + dx + columns.start : pad + dx + columns.stop] for dx in dxs])
+    windows -= patch
+    np.abs(windows, out=windows)
+    errors = np.minimum(windows.mean(axis=3), _TRUNCATION)
+    return cast("NDArray[np.float64]", np.einsum("nhw,hw->n", errors, weights).astype(float))
+
+
+def _refine(
+    a: Floats,
+    b: Floats,
+    before: Floats,
+    after: Floats,
+    centre: Point,
+    shift: Point,
+    growth: float,
+    unit: float,
+) -> tuple[Point, float]:
+    """Coordinate descent on shift and growth with ever smaller steps."""
+
+    def error(shift: Point, growth: float) -> float:
+        if not _MOST_GROWTH[0] < growth < _MOST_GROWTH[1]:
+            return math.inf
+        return _error(a, b, before, after, centre, shift, growth) + 3 * abs(math.log(growth))
+
+    least = error(shift, growth)
+    for step, ratio in ((1.0, 1.04), (0.5, 1.02), (0.25, 1.01), (0.1, 1.005)):
+        for _ in range(8):
+            near = [(shift + step * unit * np.array(d), growth) for d in _FOUR]
+            near += [(shift, growth * ratio), (shift, growth / ratio)]
+            errors = [error(*x) for x in near]
+            best = int(np.argmin(errors))
+            if errors[best] >= least - 1e-6:
+                break
+            least, (shift, growth) = errors[best], near[best]
+    return shift, growth
