@@ -141,7 +141,13 @@ def _evaluate(run: Path, episodes: int) -> None:
         print(f"\nnot evaluated; later: regil evaluate {run}", file=sys.stderr)
         raise
     print(f"\nSuccess over {episodes} unseen episodes, {results['steps']} steps of learning:")
-    for name, title in (("policy", "policy"), ("guide", "guided replay"), ("bc", "BC on the demo")):
+    for name, title in (
+        ("policy", "policy"),
+        ("best_policy", "best policy"),
+        ("corrected_guide", "corrected guide"),
+        ("guide", "guided replay"),
+        ("bc", "BC on the demo"),
+    ):
         if name in results:
             print(f"  {title:<15} {results[name]['success']:.2f}")
 

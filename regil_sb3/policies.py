@@ -165,6 +165,8 @@ class ImagePolicy(TD3Policy):
             gradients, while the actor's Q-term sees its features detached. Otherwise each has its
             own. (SB3's ``share_features_extractor`` trains a shared encoder by the actor's loss
             alone, and is refused here.)
+        q_trains_encoder: whether the actor's Q-term trains an encoder of the actor's own; if not,
+            behaviour cloning alone does.
         random_shift: largest shift of the augmentation, in pixels; 0 turns it off.
         **kwargs: the other arguments of SB3's ``TD3Policy``.
     """
@@ -177,6 +179,7 @@ class ImagePolicy(TD3Policy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         features_extractor_class: str | type[BaseFeaturesExtractor] = "conv",
         shared_encoder: bool = True,
+        q_trains_encoder: bool = True,
         random_shift: int = 4,
         **kwargs: Any,
     ) -> None:
@@ -198,6 +201,7 @@ class ImagePolicy(TD3Policy):
                 )
             features_extractor_class = _ENCODERS[features_extractor_class]
         self.shared_encoder = shared_encoder
+        self.q_trains_encoder = q_trains_encoder
         self.random_shift = random_shift
         super().__init__(
             observation_space,
@@ -230,7 +234,11 @@ class ImagePolicy(TD3Policy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         del data["share_features_extractor"]
-        data.update(shared_encoder=self.shared_encoder, random_shift=self.random_shift)
+        data.update(
+            shared_encoder=self.shared_encoder,
+            q_trains_encoder=self.q_trains_encoder,
+            random_shift=self.random_shift,
+        )
         return data
 
     def augment(self, observations: th.Tensor) -> th.Tensor:
