@@ -60,7 +60,6 @@ _RANGES: dict[str, tuple[tuple[type, ...], float, float]] = {
     "bc_floor": (_NUMBER, 0.0, 1.0),
     "bc_std": (_NUMBER, 1e-6, np.inf),
     "bc_pretrain_steps": ((int,), 0, np.inf),
-    "guide_noise": (_NUMBER, 0.0, np.inf),
     "success_buffer_size": ((int,), 1, np.inf),
     "q_coef": (_NUMBER, 0.0, np.inf),
     "exploration_std": (_NUMBER, 0.0, np.inf),
@@ -107,10 +106,6 @@ class TD3BC(TD3):
         target_policy_noise: std of the target's smoothing noise.
         target_noise_clip: its limit.
         warmup_steps: steps in which the guide acts. An episode begun in warm-up is finished in it.
-        guide_noise: std of Gaussian noise (clipped like exploration's) on the guide's scaled
-            actions when they are executed; the success buffer keeps them without, so that the
-            policy learns to come back (DART, https://arxiv.org/abs/1703.09327). Only for guides
-            that correct what they see, as ``RetrievalGuideWrapper(correction="servo")`` does.
         bc_coef: lambda at the start; 0 for no BC term.
         bc_floor: lambda's floor as a share of ``bc_coef``.
         bc_steps: steps until lambda would reach 0; None is the whole of ``learn``.
@@ -178,7 +173,6 @@ class TD3BC(TD3):
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.3,
         warmup_steps: int = 5_000,
-        guide_noise: float = 0.0,
         bc_coef: float = 2.0,
         bc_floor: float = 0.1,
         bc_steps: int | None = None,
@@ -221,7 +215,6 @@ class TD3BC(TD3):
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
         self.warmup_steps = warmup_steps
         self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps
-        self.guide_noise = guide_noise
         self.bc_schedule = bc_schedule
         self.keep_own_successes, self.actor_in_warmup = keep_own_successes, actor_in_warmup
         self._by_success = BySuccess(bc_floor)
@@ -398,39 +391,29 @@ class TD3BC(TD3):
         else:
             action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
             if self.exploration_std > 0 and action_noise is None:
-                noise = self._clipped_noise(self.exploration_std, buffer_action.shape)
+                noise = np.random.normal(0, self.exploration_std, buffer_action.shape)
+                noise = noise.clip(-self.exploration_clip, self.exploration_clip)
                 buffer_action = (buffer_action + noise).clip(-1, 1).astype(np.float32)
-                action = self._unscaled(buffer_action)
+                # float32 may put an unscaled bound outside by its last bit
+                action = self.policy.unscale_action(buffer_action)
+                action = action.clip(self.action_space.low, self.action_space.high)
         if self._guided.any():
             indices = np.flatnonzero(self._guided)
-            suggested = np.stack(self.env.env_method("guide_action", indices=indices.tolist()))
-            suggested = suggested.clip(self.action_space.low, self.action_space.high)
+            suggested = self._guide_actions("guide_action", indices)
             self._labels[indices] = self.policy.scale_action(suggested)
-            executed = self._disturbed(self._labels)
-            action[indices] = self._unscaled(executed)[indices]
-            buffer_action[indices] = executed[indices]
+            if self.env.has_attr("disturbed_action"):
+                suggested = self._guide_actions("disturbed_action", indices)
+            action[indices] = suggested
+            buffer_action[indices] = self.policy.scale_action(suggested)
         self._in_step = True
         return action, buffer_action
 
-    def _clipped_noise(self, std: float, shape: tuple[int, ...]) -> npt.NDArray[Any]:
-        noise = np.random.normal(0, std, shape)
-        return noise.clip(-self.exploration_clip, self.exploration_clip)
-
-    def _unscaled(self, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def _guide_actions(self, name: str, indices: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """What the guides of these environments say, (n, A), clipped to the action space."""
+        assert self.env is not None
         assert isinstance(self.action_space, spaces.Box)
-        # float32 may put an unscaled bound outside by its last bit
-        low, high = self.action_space.low, self.action_space.high
-        unscaled: npt.NDArray[Any] = self.policy.unscale_action(actions)
-        return unscaled.clip(low, high, out=unscaled)
-
-    def _disturbed(self, labels: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """The guide's scaled actions as they are executed: noisy where they demonstrate."""
-        if self.guide_noise == 0:
-            return labels
-        noise = self._clipped_noise(self.guide_noise, labels.shape)
-        noise[~self._demonstrates] = 0
-        executed: npt.NDArray[np.float32] = (labels + noise).clip(-1, 1).astype(np.float32)
-        return executed
+        said = np.stack(self.env.env_method(name, indices=indices.tolist()))
+        return said.clip(self.action_space.low, self.action_space.high, out=said)
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: npt.NDArray[Any] | None = None

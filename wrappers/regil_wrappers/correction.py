@@ -36,6 +36,7 @@ _SETTLE = 0.1  # s that a calibration move is given to come to rest
 _RELEASE = (10, 12)  # steps after the gripper closes: the correction starts to fade; fades over
 _WORST_RATIO = 0.95  # a registration that explains less is not believed
 _FARTHEST = 3.5  # displacements beyond this many times the plane's largest std are not believed
+_KICK_EVERY = 10  # steps of a disturbed episode, on average
 _DISTURBED = 0.5  # of a full action: a replay that was disturbed by no more is a replay
 _STILL = 0.5  # px at 84 pixels: a pair of calibration pictures that shifted less says nothing
 
@@ -83,7 +84,10 @@ class Servo:
         mirror: +1, or -1 where the picture is mirrored against the action axes, or "auto": both are
             tried, and successes decide.
         control_rate: actions a second, for how long moves take to come to rest.
-        seed: of the choice between ways of replaying.
+        disturbance: in every other episode `disturbed` pushes the hand off its way now and then, by
+            up to so many action units, so that who learns from `action` sees how to come back; 0:
+            never.
+        seed: of the choice between ways of replaying, and of disturbances.
 
     Raises:
         ValueError: if a dimension does not exist or cannot be a delta.
@@ -100,6 +104,7 @@ class Servo:
         plane: Iterable[float] = (10.0, 10.0, 0.5),
         mirror: Mirror = "auto",
         control_rate: float | None = None,
+        disturbance: float = 0.0,
         seed: int | None = None,
     ) -> None:
         self._dims = _checked_dims(list(translation_dims), low, high)
@@ -121,6 +126,8 @@ class Servo:
         self._unit = min(size) / 84
         self._actions = actions
         self._gripper = gripper_dim
+        self._disturbance = disturbance
+        self._disturbs = False
         self._limit = np.minimum(-low, high)[self._dims].astype(float)
         deltas = np.clip(actions[:, self._dims].astype(float), -self._limit, self._limit)
         self._path = np.cumsum(deltas, axis=0)
@@ -155,6 +162,7 @@ class Servo:
     _followed: bool  # whether every action was the guide's
     _at: int  # the place of the path that the hand is on its way to
     _hand: Floats  # (3,) action units from the start
+    _kick: Floats  # (3,) action units that the hand is still to be pushed
 
     def reset(self, displacement: Displacement | None = None) -> None:
         """Begin an episode.
@@ -171,8 +179,24 @@ class Servo:
         else:
             self._begin_replay(displacement)
 
+    def disturbed(self) -> NDArray[np.float32] | None:
+        """What to execute now where `action` is what to learn; None where they are the same."""
+        clean = self.action()
+        if clean is None or not np.abs(self._kick).max() > 0:
+            return None
+        pushed: NDArray[np.float32] = clean.copy()
+        pushed[self._dims] = np.clip(self._kick, -self._limit, self._limit)
+        return pushed
+
+    def _next_kick(self) -> None:
+        self._kick = self._kick - np.clip(self._kick, -self._limit, self._limit)
+        if self._disturbs and not self._kick.any() and self._rng.random() < 1 / _KICK_EVERY:
+            way = self._rng.normal(size=3)
+            size = self._disturbance * self._rng.uniform(0.5, 1)
+            self._kick = size * way / np.linalg.norm(way)
+
     def reseed(self, seed: int) -> None:
-        """Seed the choice between ways of replaying."""
+        """Seed the choice between ways of replaying, and disturbances."""
         self._rng = np.random.default_rng(seed)
 
     @property
@@ -193,7 +217,7 @@ class Servo:
             return self._segment.actions[self._step]
         if self._way.kind == "plain":
             return None
-        action = self._actions[min(self._at, len(self._actions) - 1)].copy()
+        action: NDArray[np.float32] = self._actions[min(self._at, len(self._actions) - 1)].copy()
         action[self._dims] = np.clip(self._target() - self._hand, -self._limit, self._limit)
         clipped: NDArray[np.float32] = np.clip(action, self._low, self._high)
         return clipped
@@ -220,6 +244,7 @@ class Servo:
             self._hand = self._hand + np.clip(delta, -self._limit, self._limit)
             if (np.abs(target - self._hand) <= _REACHED * self._limit).all():
                 self._at += 1
+            self._next_kick()
 
     def finish(self, success: bool) -> None:
         """The episode is over; what came of it counts where the guide chose every action."""
@@ -269,6 +294,8 @@ class Servo:
 
     def _begin_replay(self, found: Displacement | None) -> None:
         self._way = self._chosen()
+        # Every other episode goes undisturbed, and tells which way of replaying is best
+        self._disturbs = not self._disturbs and self._disturbance > 0
         if self._way.kind == "plain" or found is None or found.ratio > _WORST_RATIO:
             return
         camera = self.cameras[self._way.mirror]
@@ -308,6 +335,7 @@ class Servo:
         self._followed = True
         self._at = 0
         self._hand = np.zeros(3)
+        self._kick = np.zeros(3)
         self._way = self._plain()
         self.target_shift = np.zeros(3)
 

@@ -196,6 +196,8 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         gripper_dim: the action dimension of the gripper, positive to close; "none" without one.
         plane: how far targets move along these three, as standard deviations in action units.
         mirror: +1, or -1 where pictures are mirrored against the action axes, or "auto".
+        disturbance: how far `disturbed_action` pushes the hand off the corrected path now and then,
+            in action units; needs a correction.
 
     Raises:
         ValueError: if the demonstration does not fit the environment or an argument is out of
@@ -220,6 +222,7 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         gripper_dim: int | Literal["none"] | None = None,
         plane: list[float] | None = None,
         mirror: Literal["auto", 1, -1] | None = None,
+        disturbance: float = 0.0,
     ) -> None:
         settings = _settings(demo, encoder, k, horizon, image, step_pattern, register)
         loaded, frames = _checked(env, settings)
@@ -231,6 +234,13 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
             )
         if correction not in ("none", "servo"):
             raise ValueError(f"correction={correction!r}: choose one of ['none', 'servo']")
+        if not isinstance(disturbance, (int, float)) or not 0 <= disturbance < math.inf:
+            raise ValueError(f"disturbance={disturbance!r}: it must be a number of at least 0")
+        if disturbance > 0 and correction == "none":
+            raise ValueError(
+                f"disturbance={disturbance}: a guide without correction would not find its way "
+                "back, so set correction='servo' or disturbance=0"
+            )
         self._actions: NDArray[np.float32] = _guide_actions(env, loaded, _label(settings["demo"]))
 
         gym.utils.RecordConstructorArgs.__init__(
@@ -244,6 +254,7 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
             gripper_dim=gripper_dim,
             plane=plane,
             mirror=mirror,
+            disturbance=disturbance,
         )
         _RetrievalWrapper.__init__(self, env, loaded, settings, frames)
 
@@ -259,7 +270,9 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
                 "plane": plane,
                 "mirror": mirror,
             }
-            self._servo = _servo(env, self.retriever.picture_size, self._actions, declared)
+            self._servo = _servo(
+                env, self.retriever.picture_size, self._actions, declared, disturbance
+            )
 
     def guide_action(self) -> NDArray[np.float32]:
         """What the guide would do now: (A,) float32, in the environment's own units.
@@ -271,6 +284,18 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         """
         action = self._servo.action() if self._servo is not None else None
         return self.plain_action() if action is None else action
+
+    def disturbed_action(self) -> NDArray[np.float32]:
+        """What to execute in place of `guide_action()`: (A,) float32.
+
+        With ``disturbance`` it pushes the hand off its way now and then. Who plays it and learns
+        `guide_action()` learns to come back (DART, https://arxiv.org/abs/1703.09327).
+
+        Raises:
+            ValueError: before the first reset.
+        """
+        action = self._servo.disturbed() if self._servo is not None else None
+        return self.guide_action() if action is None else action
 
     def plain_action(self) -> NDArray[np.float32]:
         """The demonstrator's own action here: (A,) float32, in the environment's own units.
@@ -566,6 +591,7 @@ def _servo(
     size: tuple[int, int],
     actions: NDArray[np.float32],
     declared: dict[str, Any],
+    disturbance: float,
 ) -> Servo:
     """A correction with what the user declared, else what the environment says, else defaults."""
     said = env.unwrapped.metadata.get("regil") or {}
@@ -577,4 +603,12 @@ def _servo(
         chosen["gripper_dim"] = None
     space = cast("gym.spaces.Box", env.action_space)
     low, high = space.low.astype(np.float32), space.high.astype(np.float32)
-    return Servo(size, actions, low, high, control_rate=said.get("control_rate"), **chosen)
+    return Servo(
+        size,
+        actions,
+        low,
+        high,
+        control_rate=said.get("control_rate"),
+        disturbance=disturbance,
+        **chosen,
+    )
