@@ -94,7 +94,7 @@ class Settings:
     def plain(self) -> Settings:
         """The same with the demonstrator's actions and pictures as they are: the plain guide."""
         settings = copy.deepcopy(self)
-        for key, value in (("correction", "none"), ("register", False)):
+        for key, value in (("correction", "none"), ("disturbance", 0.0), ("register", False)):
             _override(settings, key, value)
         return settings
 

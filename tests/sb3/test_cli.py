@@ -17,13 +17,13 @@ from regil_sb3.training import TrainingCallback, make_env, save_model
 
 ENV = "regil/metaworld-button-press-v0"
 TINY = ["--set", "warmup_steps=150", "--set", "learning_starts=100", "--set", "bc_pretrain_steps=3",
-        "--set", "batch_size=8", "--set", "buffer_size=500", "--episodes", "2"]  # fmt: skip
+        "--set", "batch_size=8", "--set", "buffer_size=500", "--set", "eval_episodes=1",
+        "--episodes", "2"]  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     monkeypatch.setattr(training, "BC_UPDATES", 5)
-    monkeypatch.setattr(training, "SELECTION_EPISODES", 1)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,6 @@ def run(demo, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "BC_UPDATES", 5)
-        patch.setattr(training, "SELECTION_EPISODES", 1)
         words = ["train", "--env", ENV, "--demo", str(demo), "--out", str(folder), "--steps", "260"]
         assert main([*words, *TINY]) == 0
     return folder
@@ -69,7 +68,7 @@ def test_run_folder_holds_what_the_contract_names(run):
 
 def test_config_makes_the_run_again(run):
     settings = Settings.load(run / "config.yaml")
-    again = make_settings(ENV, None, 0, 260, TINY[1:10:2])
+    again = make_settings(ENV, None, 0, 260, TINY[1:12:2])
     assert settings == again
 
 
