@@ -175,8 +175,8 @@ def test_presets_are_plain_yaml_and_fit():
         ("frame_stack=3", lambda s: s.frame_stack, 3),
         ("env_kwargs.camera=corner2", lambda s: s.env_kwargs, {"camera": "corner2"}),
         ("guide_patience=8", lambda s: s.wrappers("d")[0][1]["guide_patience"], 8),
-        ("policy_kwargs.shared_encoder=false", lambda s: s.hyperparams["policy_kwargs"],
-         {"shared_encoder": False}),
+        ("policy_kwargs.shared_encoder=true", lambda s: s.hyperparams["policy_kwargs"],
+         {"shared_encoder": True, "q_trains_encoder": False}),
     ],
 )  # fmt: skip
 def test_overrides(override, where, value):
@@ -225,7 +225,7 @@ def test_bad_input_is_one_line_and_status_2(words, message, tmp_path, monkeypatc
         (["--set", "env_kwargs.nonsense=1"], "nonsense"),
         (["--set", "policy_kwargs.foo=1"], "foo"),
         (["--set", "bc_steps=0"], "bc_steps is 0"),
-        (["--steps", "3000"], "end before the warm-up of 5000"),
+        (["--steps", "1500"], "end before the warm-up of 2000"),
         (["--set", "env_kwargs.camera=corner"], "camera"),
         (["--set", "env_kwargs.size=96"], "--size 96"),
     ],
