@@ -284,7 +284,8 @@ def _actions(value: Any, n: int, metadata: dict[str, Any]) -> NDArray[np.float32
     for key, outside in (("action_low", np.less), ("action_high", np.greater)):
         if metadata[key] is None:
             continue
-        limit = np.asarray(metadata[key], dtype=np.float32)
+        with np.errstate(over="ignore"):  # beyond float32 is no limit
+            limit = np.asarray(metadata[key], dtype=np.float32)
         if limit.shape != array.shape[1:]:
             raise ValueError(f"{key} has {limit.size} numbers but actions have {array.shape[1]}")
         bad = np.argwhere(outside(array, limit))

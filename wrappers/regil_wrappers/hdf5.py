@@ -16,14 +16,16 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from struct import unpack_from
 from typing import Any
 
 import h5py  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import NDArray
 
-from regil_wrappers.limits import MAX_PIXELS, MAX_TEXT, Budget
+from regil_wrappers.limits import MAX_BYTES, MAX_PIXELS, MAX_TEXT, Budget
 
 __all__ = ["SIGNATURE", "array", "encoded_pictures", "has", "json_attribute", "member", "opened"]
 
@@ -45,6 +47,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
     with path.open("rb") as stream:
         if stream.read(8) != SIGNATURE:
             raise ValueError("this is not an HDF5 file: record one with 'regil record'")
+    _check_heaps(path)
     try:
         file = h5py.File(path, "r")
     except OSError as error:
@@ -53,6 +56,35 @@ def opened(path: Path) -> Iterator[h5py.File]:
         raise ValueError(f"the HDF5 file is damaged ({error})") from error
     with file:
         yield file
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse global heaps whose parts do not fill them: HDF5 2.0 walks those for ever.
+
+    They hold texts and values of variable length. Larger files than `MAX_BYTES` are not searched.
+    """
+    size = path.stat().st_size
+    if not 16 <= size <= MAX_BYTES:
+        return
+    with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as content:
+        at = 9 if content[8] > 1 else 13
+        if content[at : at + 2] != b"\x08\x08":
+            raise ValueError("the HDF5 file has addresses of other than 8 bytes, or is damaged")
+        start = content.find(b"GCOL\1\0\0\0")
+        while start >= 0:
+            (length,) = unpack_from("<Q", content, start + 8) if start + 16 <= size else (0,)
+            end = start + length
+            place = start + 16
+            if not place <= end <= size:
+                raise ValueError("the HDF5 file is damaged (a heap is larger than the file)")
+            while place + 16 <= end:
+                index, _, part = unpack_from("<HHxxxxQ", content, place)
+                # The free rest counts its own header.
+                step = part if index == 0 else 16 + (part + 7) // 8 * 8
+                if step < 16 or place + step > end:
+                    raise ValueError("the HDF5 file is damaged (a heap's part does not fit)")
+                place += step
+            start = content.find(b"GCOL\1\0\0\0", start + 8)
 
 
 def has(group: h5py.Group, name: str) -> bool:

@@ -16,6 +16,7 @@ import inspect
 import os
 import shutil
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
@@ -131,6 +132,7 @@ _DAMAGED = (
     ArithmeticError,
     MemoryError,
     struct.error,
+    tokenize.TokenError,
     zlib.error,
     zipfile.BadZipFile,
 )

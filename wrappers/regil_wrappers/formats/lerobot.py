@@ -92,7 +92,7 @@ def read(
     if not film:
         wanted.append(camera)
     rows = _episode_rows(data, episode, ["episode_index", *wanted], ["action", "next.success"])
-    length = len(next(iter(rows.values())))
+    length = sum(len(part) for part in rows["episode_index"])
     rate = info.get("fps")
     if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not 0 < rate <= 1000:
         raise ValueError(f"fps in meta/info.json is {rate!r}")

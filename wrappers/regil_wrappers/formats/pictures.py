@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,7 +20,7 @@ from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.formats.changes import Pictures
 from regil_wrappers.limits import MAX_PIXELS, need
 
-__all__ = ["decoded", "png", "read", "suffixes", "write"]
+__all__ = ["check_pixels", "decoded", "no_bombs", "png", "read", "suffixes", "write"]
 
 suffixes = (".png", ".jpg", ".jpeg")
 
@@ -69,11 +71,22 @@ def decoded(file: BinaryIO | bytes) -> NDArray[np.uint8]:
     image = need("PIL.Image", "video", "reading pictures")
     stream = io.BytesIO(file) if isinstance(file, bytes) else file
     # Pillow reads the header alone here.
-    with image.open(stream, formats=("PNG", "JPEG")) as picture:
+    with no_bombs(image), image.open(stream, formats=("PNG", "JPEG")) as picture:
         check_pixels(*picture.size)
         if picture.mode not in ("RGB", "RGBA", "L", "P", "LA"):
             raise ValueError(f"a picture is of mode {picture.mode}: it must be 8-bit RGB or grey")
         return np.asarray(picture.convert("RGB"))
+
+
+@contextmanager
+def no_bombs(image: Any) -> Iterator[None]:
+    """Make Pillow's own errors and warnings on too many pixels a `ValueError`."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", image.DecompressionBombWarning)
+            yield
+    except (image.DecompressionBombError, image.DecompressionBombWarning) as error:
+        raise ValueError(f"a picture has over {MAX_PIXELS} pixels") from error
 
 
 def check_pixels(width: int, height: int) -> None:

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from regil_wrappers.demonstration import Demonstration
+from regil_wrappers.formats.boxes import check_boxes
 from regil_wrappers.formats.changes import Pictures
-from regil_wrappers.formats.pictures import check_pixels
+from regil_wrappers.formats.pictures import check_pixels, no_bombs
 from regil_wrappers.limits import MAX_PIXELS, need
 
 __all__ = ["read_gif", "read_mp4", "write_gif", "write_mp4"]
@@ -43,33 +44,41 @@ def read_mp4(
     times: list[float] = []
     # The format is named, and the file handed over open: a play list under another name must not
     # make FFmpeg open what it lists.
-    with path.open("rb") as file, av.open(file, format="mp4") as container:
-        if not container.streams.video:
-            raise ValueError("there is no film in this file")
-        stream = container.streams.video[0]
-        context = stream.codec_context
-        if context is None or context.codec.name not in _CODECS:
-            name = "unknown" if context is None else context.codec.name
-            raise ValueError(f"the film is coded with {name!r}: one of {list(_CODECS)} is read")
-        check_pixels(context.width, context.height)
-        context.options = {"max_pixels": str(MAX_PIXELS)}
-        context.thread_count = 1
-        if start:
-            container.seek(int(start / stream.time_base), stream=stream)
-        tolerance = 0.5 / float(stream.average_rate or 1000)
-        for frame in container.decode(stream):
-            time = float(frame.time if frame.time is not None else len(times) * 2 * tolerance)
-            if time < start - tolerance:
-                continue
-            if frames is not None and len(times) == frames:
-                break
-            check_pixels(frame.width, frame.height)
-            picture = frame.to_ndarray(format="rgb24")
-            pictures.add(np.rot90(picture, round(frame.rotation / 90)))
-            times.append(time - start)
+    with path.open("rb") as file:
+        check_boxes(file)
+        with av.open(file, format="mp4") as container:
+            _decode(container, pictures, start, frames, times)
     if frames is not None and len(times) != frames:
         raise ValueError(f"the film has {len(times)} frames from {start:g} s on, not {frames}")
     return {"metadata": _timing(times)}
+
+
+def _decode(
+    container: Any, pictures: Pictures, start: float, frames: int | None, times: list[float]
+) -> None:
+    if not container.streams.video:
+        raise ValueError("there is no film in this file")
+    stream = container.streams.video[0]
+    context = stream.codec_context
+    if context is None or context.codec.name not in _CODECS:
+        name = "unknown" if context is None else context.codec.name
+        raise ValueError(f"the film is coded with {name!r}: one of {list(_CODECS)} is read")
+    check_pixels(context.width, context.height)
+    context.options = {"max_pixels": str(MAX_PIXELS)}
+    context.thread_count = 1
+    if start:
+        container.seek(int(start / stream.time_base), stream=stream)
+    tolerance = 0.5 / float(stream.average_rate or 1000)
+    for frame in container.decode(stream):
+        time = float(frame.time if frame.time is not None else len(times) * 2 * tolerance)
+        if time < start - tolerance:
+            continue
+        if frames is not None and len(times) == frames:
+            break
+        check_pixels(frame.width, frame.height)
+        picture = frame.to_ndarray(format="rgb24")
+        pictures.add(np.rot90(picture, round(frame.rotation / 90)))
+        times.append(time - start)
 
 
 def read_gif(path: Path, pictures: Pictures) -> dict[str, Any]:
@@ -81,7 +90,7 @@ def read_gif(path: Path, pictures: Pictures) -> dict[str, Any]:
     """
     image = need("PIL.Image", "video", "reading gif")
     times, now = [], 0.0
-    with image.open(path, formats=("GIF",)) as film:
+    with no_bombs(image), image.open(path, formats=("GIF",)) as film:
         while True:
             check_pixels(*film.size)
             pictures.add(np.asarray(film.convert("RGB")))
