@@ -34,6 +34,8 @@ from regil_wrappers.formats.changes import (
     Pictures,
     ResampledActions,
     Size,
+    check_actions,
+    check_rate,
     resample,
 )
 from regil_wrappers.limits import Budget
@@ -195,8 +197,12 @@ def read(
     name = detect(path) if format is None else format
     known = _format(name)
     _check_options(name, known.read, options)
-    if source_fps is not None and not 0 < source_fps <= 1000:
-        raise ValueError(f"source_fps={source_fps!r}: above 0 and at most 1000")
+    for rate_name, rate in (("source_fps", source_fps), ("fps", fps)):
+        if rate is not None:
+            check_rate(rate_name, rate)
+    check_actions(actions)
+    if fps is None and actions not in ("refuse", "drop"):
+        raise ValueError(f"actions={actions!r} says what fps= makes of them: give both")
     taken = Pictures(Budget(), flip, crop, size, encoder_size)
     try:
         fields = known.read(path, taken, **options)

@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.limits import Budget
 
-__all__ = ["FLIPS", "RESAMPLED_ACTIONS", "Flip", "Pictures", "ResampledActions", "Size", "resample"]
+__all__ = [
+    "FLIPS",
+    "Flip",
+    "Pictures",
+    "ResampledActions",
+    "Size",
+    "check_actions",
+    "check_rate",
+    "resample",
+]
 
 Flip = Literal["rows", "columns", "both"]
 Size = int | Sequence[int]
@@ -205,10 +214,8 @@ def resample(
     Raises:
         ValueError: if the rate is not known, an argument is out of range, or actions are refused.
     """
-    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= 1000:
-        raise ValueError(f"fps={fps!r}: give frames a second, above 0 and at most 1000")
-    if actions not in RESAMPLED_ACTIONS:
-        raise ValueError(f"actions={actions!r}: choose one of {list(RESAMPLED_ACTIONS)}")
+    check_rate("fps", fps)
+    check_actions(actions)
     n, rate = len(demo), demo.metadata["control_rate"]
     times = demo.metadata.get("frame_times")
     if rate is None and times is None:
@@ -269,6 +276,26 @@ def resample(
         successes=rows(demo.successes),
         metadata=metadata,
     )
+
+
+def check_rate(name: str, rate: float) -> None:
+    """Refuse what is no number of frames a second.
+
+    Raises:
+        ValueError: naming it.
+    """
+    if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not 0 < rate <= 1000:
+        raise ValueError(f"{name}={rate!r}: give frames a second, above 0 and at most 1000")
+
+
+def check_actions(actions: str) -> None:
+    """Refuse what `resample` does not know.
+
+    Raises:
+        ValueError: naming it.
+    """
+    if actions not in RESAMPLED_ACTIONS:
+        raise ValueError(f"actions={actions!r}: choose one of {list(RESAMPLED_ACTIONS)}")
 
 
 def _dimensions(held: Sequence[int], size: int) -> list[int]:
