@@ -102,6 +102,7 @@ def test_libero_is_stored_upside_down(tmp_path: Path) -> None:
     assert demo.metadata["provenance"][0]["rows"] == "turned round"
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Minari's, on what a toy leaves out
 @pytest.mark.parametrize("storage", ["hdf5", "arrow", "parquet"])
 @pytest.mark.parametrize("coded", [False, True])
 @pytest.mark.parametrize("several", [False, True])
@@ -269,7 +270,9 @@ def test_resampling(n: int, outcome: bool, rate: int, fps: float) -> None:
         assert shown[0] == 0
         assert shown[-1] == n - 1  # the outcome is never lost
         moments = np.arange(len(shown) - 1) / fps
-        assert (np.abs(shown[:-1] - np.floor(moments * rate + 1e-3)) <= 1e-9).all() or fps == rate
+        if fps != rate:  # at a boundary within rounding, either frame is right
+            assert (shown[:-1] >= np.floor(moments * rate - 1e-3)).all()
+            assert (shown[:-1] <= np.floor(moments * rate + 1e-3)).all()
     assert summed.actions is not None
     assert meant.actions is not None
     np.testing.assert_allclose(summed.actions[:, 0].sum(dtype=np.float64), total[0], atol=1e-3)
