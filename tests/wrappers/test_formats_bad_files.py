@@ -79,7 +79,11 @@ def npy(shape: tuple[int, ...], content: bytes) -> bytes:
 
 
 def test_zip_bombs(tmp_path: Path) -> None:
-    claims = ((10**5, 500, 500, 3), "claims"), ((2**40, 8, 8, 3), "claims"), ((-1, 8, 8, 3), "only numbers")
+    claims = (
+        ((10**5, 500, 500, 3), "claims"),
+        ((2**40, 8, 8, 3), "claims"),
+        ((-1, 8, 8, 3), "only numbers"),
+    )
     for shape, message in claims:
         with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("frames.npy", npy(shape, bytes(10**6)))
