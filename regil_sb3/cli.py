@@ -1,4 +1,4 @@
-"""The command line: ``regil record | train | evaluate | report | bench``."""
+"""The command line: ``regil record | convert | train | evaluate | report | bench``."""
 
 from __future__ import annotations
 
@@ -24,6 +24,39 @@ def _parser() -> argparse.ArgumentParser:
     )
     record.add_argument(
         "--env-kwargs", nargs="*", default=[], metavar="KEY=VALUE", help="e.g. size=128"
+    )
+
+    convert = commands.add_parser("convert", help="a demonstration from one format to another")
+    convert.add_argument("source", type=Path, metavar="IN", help="file or folder")
+    convert.add_argument("target", type=Path, metavar="OUT", help="new file or folder")
+    convert.add_argument("--from", dest="source_format", metavar="FORMAT", help="of IN (looked up)")
+    convert.add_argument("--format", help="of OUT (by its suffix)")
+    convert.add_argument("--episode", type=int, help="which, of several (0)")
+    convert.add_argument("--camera", help="key of the pictures")
+    convert.add_argument("--observations", nargs="*", metavar="KEY", help="others to keep (all)")
+    convert.add_argument(
+        "--flip",
+        choices=["rows", "columns", "both"],
+        help="put pictures right that are stored turned",
+    )
+    convert.add_argument(
+        "--crop", type=int, nargs=4, metavar=("TOP", "LEFT", "HEIGHT", "WIDTH"), help="pixels"
+    )
+    for flag, what in (
+        ("--size", "height and width, or one number"),
+        ("--encoder-size", "the same, of a second, larger copy for the encoder"),
+    ):
+        convert.add_argument(flag, type=int, nargs="+", metavar="PIXELS", help=what)
+    convert.add_argument("--source-fps", type=float, help="frames a second of IN, if it says none")
+    convert.add_argument("--fps", type=float, help="resample to so many frames a second")
+    convert.add_argument(
+        "--actions",
+        choices=["refuse", "drop", "sum", "mean", "last"],
+        default="refuse",
+        help="what --fps makes of actions: sum or mean of deltas, last of targets (refuse)",
+    )
+    convert.add_argument(
+        "--held", type=int, nargs="+", default=[], metavar="DIM", help="that take the last: gripper"
     )
 
     train = commands.add_parser("train", help="learn, evaluate, and write a report")
@@ -87,6 +120,41 @@ def _record(
         f"{path}: {len(demo)} frames, seed {demo.metadata['seed']}, "
         f"{tried} {'seed' if tried == 1 else 'seeds'} tried"
     )
+
+
+def _convert(args: argparse.Namespace) -> None:
+    from regil_wrappers import formats
+
+    if args.target.exists():
+        raise ValueError(f"{args.target} exists already: name another, or remove it")
+    chosen = ("episode", "camera", "observations")
+    demo = formats.read(
+        args.source,
+        args.source_format,
+        flip=args.flip,
+        crop=args.crop,
+        size=_one_or_two(args.size),
+        encoder_size=_one_or_two(args.encoder_size),
+        source_fps=_whole(args.source_fps),
+        fps=_whole(args.fps),
+        actions=args.actions,
+        held=args.held,
+        **{name: getattr(args, name) for name in chosen if getattr(args, name) is not None},
+    )
+    lost = formats.write(demo, args.target, args.format)
+    kept = "no actions" if demo.actions is None else f"{len(demo.actions)} actions"
+    height, width = demo.frames.shape[1:3]
+    print(f"{args.target}: {len(demo)} frames of {height}x{width}, {kept}")
+    if lost:
+        print(f"not kept: {', '.join(lost)}", file=sys.stderr)
+
+
+def _one_or_two(values: list[int] | None) -> int | list[int] | None:
+    return values[0] if values is not None and len(values) == 1 else values
+
+
+def _whole(rate: float | None) -> float | None:
+    return int(rate) if rate is not None and rate.is_integer() else rate
 
 
 def _train(args: argparse.Namespace) -> None:
@@ -174,6 +242,8 @@ def main(argv: list[str] | None = None) -> int:
             if args.size is not None:
                 env_kwargs["size"] = args.size
             _record(args.env, out, args.seed, env_kwargs, args.encoder_size)
+        elif args.command == "convert":
+            _convert(args)
         elif args.command == "train":
             _train(args)
         elif args.command == "evaluate":

@@ -234,7 +234,7 @@ IMAGE = "data/demo_0/obs/agentview_image"
     ("change", "message"),
     [
         (without("data"), "not a ReGIL demonstration"),
-        (without("data/demo_0"), "not a ReGIL demonstration"),
+        (without("data/demo_0"), "no '/data/demo_0'"),
         (without(IMAGE), "no '/data/demo_0/obs/agentview_image'"),
         (without("data/demo_0/final_obs/state"), "no '/data/demo_0/final_obs/state'"),
         (without("data/demo_0/final_obs"), "7|6"),

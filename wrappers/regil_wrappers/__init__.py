@@ -1,5 +1,6 @@
 """A dense reward and a guide from one demonstration, as Gymnasium wrappers."""
 
+from regil_wrappers import formats
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.encoders import Encoder, encoder_names, make_encoder, register_encoder
 from regil_wrappers.retrieval import Alignment, Retriever
@@ -13,6 +14,7 @@ __all__ = [
     "RetrievalRewardWrapper",
     "Retriever",
     "encoder_names",
+    "formats",
     "make_encoder",
     "register_encoder",
 ]

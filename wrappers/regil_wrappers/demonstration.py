@@ -1,41 +1,40 @@
 """One demonstration: what was seen and what was done. In memory and as one HDF5 file.
 
 The file has the layout of `robomimic <https://robomimic.github.io>`_, with one episode. N frames
-and T actions (N = T + 1, or N = T), or no actions (T = N then):
+and T actions (N = T + 1, or N = T), or no actions (T = N then). In ``data``:
 
-=====================================  ==================  =========================================
-name                                   shape, dtype        meaning
-=====================================  ==================  =========================================
-``data`` attribute ``total``           int                 T
-``data`` attribute ``env_args``        JSON text           ``env_name`` (Gymnasium id), ``type`` (2:
-                                                           robomimic's number for Gym),
-                                                           ``env_kwargs``
-``data`` attribute                     JSON text           `Demonstration.metadata`, with
-``regil_metadata``                                         ``format_version``
-``data/demo_0`` attr. ``num_samples``  int                 T
-``data/demo_0`` attr.                  JSON text           names in ``obs`` that belong to
-``observations``                                           `Demonstration.observations`: null
-(none),
-                                                           a name (array) or a list of names (dict)
-``data/demo_0/actions``                (T, A) float32      executed actions, in the environment's
-units ``data/demo_0/successes``              (N,) uint8          1 where the task is solved in that
-frame ``data/demo_0/obs/agentview_image``    (T, H, W, 3) uint8  frames 0..T-1, RGB, upright
-``data/demo_0/obs/encoder_image``      (T, h, w, 3) uint8  the same moments, larger, for encoders
-``data/demo_0/obs/<name>``             (T, ...)            observations of a policy without a camera
-``data/demo_0/final_obs/<name>``       as in ``obs``       the frame after the last action, for each
-                                       without T           name in ``obs``; only where N = T + 1
-=====================================  ==================  =========================================
+==============================  ==================  ================================================
+attribute ``total``             int                 T
+attribute ``env_args``          JSON text           ``env_name`` (Gymnasium id), ``type`` (2:
+                                                    robomimic's number for Gym), ``env_kwargs``
+attribute ``regil_metadata``    JSON text           `Demonstration.metadata`, with
+                                                    ``format_version``
+==============================  ==================  ================================================
 
-Everything but the images is optional; arrays are gzip-compressed.
+and in ``data/demo_0``:
+
+==============================  ==================  ================================================
+attribute ``num_samples``       int                 T
+attribute ``observations``      JSON text           names in ``obs`` that belong to
+                                                    `Demonstration.observations`: null (none), a
+                                                    name (array) or a list of names (dict)
+``actions``                     (T, A) float32      executed actions, in the environment's units
+``successes``                   (N,) uint8          1 where the task is solved in that frame
+``obs/agentview_image``         (T, H, W, 3) uint8  frames 0..T-1, RGB, upright
+``obs/encoder_image``           (T, h, w, 3) uint8  the same moments, larger, for encoders
+``obs/<name>``                  (T, ...)            observations of a policy without a camera
+``final_obs/<name>``            as in ``obs``       the frame after the last action, for each name
+                                without T           in ``obs``; only where N = T + 1
+==============================  ==================  ================================================
+
+Everything but the images is optional; arrays are gzip-compressed. Other layouts are read and
+written by `regil_wrappers.formats`.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,6 +43,9 @@ import h5py  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import NDArray
 
+from regil_wrappers import hdf5
+from regil_wrappers.limits import Budget
+
 __all__ = ["FORMAT_VERSION", "Demonstration"]
 
 FORMAT_VERSION = 1
@@ -51,12 +53,6 @@ FORMAT_VERSION = 1
 _FRAMES = "agentview_image"
 _ENCODER_FRAMES = "encoder_image"
 _OBSERVATION = "observation"
-
-# What a file may claim before memory is allocated for it. Deflate cannot shrink by more than about
-# 1032.
-_MAX_BYTES = 4 * 1024**3
-_MAX_COMPRESSION = 1100
-_MAX_TEXT = 1_000_000
 
 _METADATA_DEFAULTS: dict[str, Any] = {
     "env_id": None,
@@ -70,6 +66,7 @@ _METADATA_DEFAULTS: dict[str, Any] = {
     "seed": None,
     "seeds_tried": None,
     "versions": {},
+    "provenance": [],
     "format_version": FORMAT_VERSION,
 }
 
@@ -99,6 +96,7 @@ class Demonstration:
             ``render`` (dict of render settings), ``image_size`` ([H, W], pixels), ``action_repeat``
             (int), ``control_rate`` (Hz, of actions), ``action_low`` and ``action_high`` (lists of A
             numbers), ``seed``, ``seeds_tried`` (int), ``versions`` (dict of packages),
+            ``provenance`` (list of what was done to it since it was recorded, oldest first),
             ``format_version`` (int). Unknown ones are None, or empty.
 
     Raises:
@@ -238,8 +236,8 @@ class Demonstration:
         if path.is_dir():
             raise ValueError(f"demo {str(path)!r} is a folder: name the HDF5 file in it")
         try:
-            with _opened(path) as file:
-                return cls(**_read(file, path.stat().st_size))
+            with hdf5.opened(path) as file:
+                return cls(**_read(file, Budget(path.stat().st_size)))
         except PermissionError:
             raise
         except (ValueError, TypeError, KeyError, OSError, RuntimeError, RecursionError) as error:
@@ -286,7 +284,8 @@ def _actions(value: Any, n: int, metadata: dict[str, Any]) -> NDArray[np.float32
     for key, outside in (("action_low", np.less), ("action_high", np.greater)):
         if metadata[key] is None:
             continue
-        limit = np.asarray(metadata[key], dtype=np.float32)
+        with np.errstate(over="ignore"):  # beyond float32 is no limit
+            limit = np.asarray(metadata[key], dtype=np.float32)
         if limit.shape != array.shape[1:]:
             raise ValueError(f"{key} has {limit.size} numbers but actions have {array.shape[1]}")
         bad = np.argwhere(outside(array, limit))
@@ -327,6 +326,7 @@ def _metadata(given: Any, size: list[int]) -> dict[str, Any]:
         "seed": (int,),
         "seeds_tried": (int,),
         "versions": (dict,),
+        "provenance": (list,),
     }
     for key, types in wanted.items():
         if metadata[key] is not None and type(metadata[key]) not in types:
@@ -352,97 +352,43 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
-    with path.open("rb") as stream:
-        if stream.read(8) != b"\x89HDF\r\n\x1a\n":
-            raise ValueError("this is not an HDF5 file: record one with 'regil record'")
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        if "truncated" in str(error):
-            raise ValueError("the file is cut short: copy it again, or record another") from error
-        raise ValueError(f"the HDF5 file is damaged ({error})") from error
-    with file:
-        yield file
-
-
-def _read(file: h5py.File, file_bytes: int) -> dict[str, Any]:
-    data = _member(file, "data", h5py.Group)
+def _read(file: h5py.File, budget: Budget) -> dict[str, Any]:
+    data = hdf5.member(file, "data", h5py.Group) if hdf5.has(file, "data") else file
     if "regil_metadata" not in data.attrs:
         raise ValueError(
-            "this HDF5 file is not a ReGIL demonstration (no attribute 'regil_metadata')"
+            "this HDF5 file is not a ReGIL demonstration (no attribute 'regil_metadata' of 'data'):"
+            " 'regil convert' makes one from other formats"
         )
-    metadata = _json(data, "regil_metadata")
-    demo = _member(data, "demo_0", h5py.Group)
-    obs = _member(demo, "obs", h5py.Group)
-    final = _member(demo, "final_obs", h5py.Group) if "final_obs" in demo else None
+    metadata = hdf5.json_attribute(data, "regil_metadata")
+    demo = hdf5.member(data, "demo_0", h5py.Group)
+    obs = hdf5.member(demo, "obs", h5py.Group)
+    final = hdf5.member(demo, "final_obs", h5py.Group) if hdf5.has(demo, "final_obs") else None
 
     def joined(name: str) -> NDArray[Any]:
-        first = _array(obs, name, file_bytes)
+        first = hdf5.array(obs, name, budget)
         if final is None:
             return first
-        last = _array(final, name, file_bytes)
+        last = hdf5.array(final, name, budget)
         if first.ndim == 0 or last.shape != first.shape[1:] or last.dtype != first.dtype:
             raise ValueError(f"final_obs/{name} does not fit obs/{name}")
         return np.concatenate([first, last[None]])
 
-    stored = _json(demo, "observations")
+    stored = hdf5.json_attribute(demo, "observations")
     observations: Any = None
     if isinstance(stored, str):
         observations = joined(stored)
     elif isinstance(stored, list):
+        if len({str(name) for name in stored}) != len(stored):
+            raise ValueError("attribute 'observations' names one thing twice")
         observations = {name: joined(name) for name in stored}
     elif stored is not None:
         raise ValueError("attribute 'observations' must be null, a name or a list of names")
-    successes = _array(demo, "successes", file_bytes) if "successes" in demo else None
+    successes = hdf5.array(demo, "successes", budget) if hdf5.has(demo, "successes") else None
     return {
         "frames": joined(_FRAMES),
-        "actions": _array(demo, "actions", file_bytes) if "actions" in demo else None,
+        "actions": hdf5.array(demo, "actions", budget) if hdf5.has(demo, "actions") else None,
         "observations": observations,
-        "encoder_frames": joined(_ENCODER_FRAMES) if _ENCODER_FRAMES in obs else None,
+        "encoder_frames": joined(_ENCODER_FRAMES) if hdf5.has(obs, _ENCODER_FRAMES) else None,
         "successes": None if successes is None else successes.astype(np.bool_),
         "metadata": metadata,
     }
-
-
-def _member(group: h5py.Group, name: Any, kind: type) -> Any:
-    """An object stored in this very file: links that lead elsewhere are not followed."""
-    where = f"{group.name.rstrip('/')}/{name}"
-    if not isinstance(name, str) or "/" in name:
-        raise ValueError(f"{where!r} is no name of a member")
-    link = group.get(name, getlink=True)
-    if link is None:
-        raise ValueError(f"this HDF5 file is not a ReGIL demonstration (no {where!r})")
-    if not isinstance(link, h5py.HardLink):
-        raise ValueError(f"{where!r} is a link to somewhere else: links are not followed")
-    member = group[name]
-    if not isinstance(member, kind):
-        raise ValueError(f"{where!r} is not a {kind.__name__.lower()}")
-    return member
-
-
-def _array(group: h5py.Group, name: Any, file_bytes: int) -> NDArray[Any]:
-    dataset = _member(group, name, h5py.Dataset)
-    if dataset.dtype.kind not in "biuf" or dataset.shape is None:
-        raise ValueError(f"{dataset.name!r} does not hold numbers")
-    if dataset.is_virtual or dataset.external:
-        raise ValueError(f"{dataset.name!r} keeps its values in another file: that is not followed")
-    if dataset.compression not in (None, "gzip", "lzf"):
-        raise ValueError(f"{dataset.name!r} is compressed with {dataset.compression!r}: use gzip")
-    claimed = math.prod(dataset.shape) * dataset.dtype.itemsize
-    if claimed > _MAX_BYTES or claimed > _MAX_COMPRESSION * file_bytes:
-        raise ValueError(f"{dataset.name!r} claims {claimed} bytes, more than this file can hold")
-    try:
-        return np.asarray(dataset[()])
-    except OSError as error:
-        raise ValueError(f"{dataset.name!r} cannot be read, the file is damaged") from error
-
-
-def _json(group: h5py.Group, name: str) -> Any:
-    if name not in group.attrs:
-        raise ValueError(f"this HDF5 file is not a ReGIL demonstration (no attribute {name!r})")
-    text = group.attrs[name]
-    if not isinstance(text, str) or len(text) > _MAX_TEXT:
-        raise ValueError(f"attribute {name!r} is not a JSON text")
-    return json.loads(text)
