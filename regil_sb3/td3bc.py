@@ -268,16 +268,21 @@ class TD3BC(TD3):
         late = self.env is not None and rewards_come_late(self.env)
         if chosen is None and (late or is_image_space(space)):
             buffer = episode_reward_class(space, self.n_steps) if late else FrameReplayBuffer
-            returns = {"n_steps": self.n_steps, "gamma": self.gamma} if self.n_steps > 1 else {}
-            stacks = {"n_stack": self.n_stack} if is_image_space(space) else {}
+            own: dict[str, Any] = (
+                {"n_stack": self.n_stack}
+                if is_image_space(space)
+                else {"optimize_memory_usage": self.optimize_memory_usage}
+            )
+            if is_image_space(space) or self.n_steps > 1:
+                own |= {"n_steps": self.n_steps, "gamma": self.gamma}
             # TD3's set-up would warn that n_steps is ignored for a class of one's own
-            self.replay_buffer = buffer(
+            self.replay_buffer = buffer(  # type: ignore[assignment]
                 self.buffer_size,
                 space,
                 self.action_space,
                 self.device,
                 self.n_envs,
-                **{**stacks, **returns, **self.replay_buffer_kwargs},
+                **(own | self.replay_buffer_kwargs),
             )
         self.success_buffer = SuccessBuffer(
             self.success_buffer_size, self.n_stack if is_image_space(space) else 1
