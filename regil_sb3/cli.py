@@ -95,6 +95,7 @@ def _train(args: argparse.Namespace) -> None:
     from regil_sb3 import training
     from regil_sb3.settings import encoder_size, make_settings
 
+    training.keep_freed_memory()
     training.set_threads()
     if args.resume is None and not args.env:
         raise ValueError("--env is missing: name an environment, or --resume a run")
@@ -133,6 +134,7 @@ def _train(args: argparse.Namespace) -> None:
 def _evaluate(run: Path, episodes: int) -> None:
     from regil_sb3 import training
 
+    training.keep_freed_memory()
     if episodes < 1:
         raise ValueError(f"--episodes is {episodes}: at least 1 is needed")
     try:
@@ -141,7 +143,13 @@ def _evaluate(run: Path, episodes: int) -> None:
         print(f"\nnot evaluated; later: regil evaluate {run}", file=sys.stderr)
         raise
     print(f"\nSuccess over {episodes} unseen episodes, {results['steps']} steps of learning:")
-    for name, title in (("policy", "policy"), ("guide", "guided replay"), ("bc", "BC on the demo")):
+    for name, title in (
+        ("policy", "policy"),
+        ("best_policy", "best policy"),
+        ("corrected_guide", "corrected guide"),
+        ("guide", "guided replay"),
+        ("bc", "BC on the demo"),
+    ):
         if name in results:
             print(f"  {title:<15} {results[name]['success']:.2f}")
 

@@ -67,7 +67,7 @@ def policy_act(model: BaseAlgorithm) -> Act:
 
 
 def guide_act(obs: Any, env: VecEnv) -> npt.NDArray[Any]:
-    """Guided replay: what ``RetrievalGuideWrapper`` suggests."""
+    """Guided replay: what ``RetrievalGuideWrapper`` suggests, corrected where it corrects."""
     return np.stack(env.env_method("guide_action"))
 
 

@@ -34,21 +34,21 @@ def random_shift(images: th.Tensor, pad: int) -> th.Tensor:
     if pad == 0:
         return images
     n, channels, height, width = images.shape
-    inner = slice(pad, -pad)
-    padded = images.new_empty(n, channels, height + 2 * pad, width + 2 * pad)
-    padded[..., inner, inner] = images
-    padded[..., :pad, inner] = images[..., :1, :]
-    padded[..., -pad:, inner] = images[..., -1:, :]
-    padded[..., :pad] = padded[..., pad : pad + 1]
-    padded[..., -pad:] = padded[..., -pad - 1 : -pad]
-    corners = th.randint(0, 2 * pad + 1, (n, 2)).tolist()
-    # Slices copy whole rows: on a CPU five times faster than one gather over an unfolded view.
-    return th.stack(
-        [
-            image[:, y : y + height, x : x + width]
-            for image, (y, x) in zip(padded, corners, strict=True)
-        ]
-    )
+    size = channels * height * width
+    shifted = th.empty(images.shape, dtype=images.dtype)
+    pairs = zip(images.cpu().reshape(n, size).numpy(), shifted.numpy(), strict=True)
+    corners = th.randint(0, 2 * pad + 1, (n, 2)) - pad
+    for (old, new), (y, x) in zip(pairs, corners.tolist(), strict=True):
+        # One block of memory moves; what wraps around is then overwritten by the border.
+        offset = y * width + x
+        start, stop = max(-offset, 0), size - max(offset, 0)
+        new.reshape(size)[start:stop] = old[start + offset : stop + offset]
+        top, bottom, left, right = max(-y, 0), height - max(y, 0), max(-x, 0), width - max(x, 0)
+        new[..., :left] = new[..., left : left + 1]
+        new[..., right:] = new[..., right - 1 : right]
+        new[:, :top] = new[:, top : top + 1]
+        new[:, bottom:] = new[:, bottom - 1 : bottom]
+    return shifted.to(images.device)
 
 
 class ConvEncoder(BaseFeaturesExtractor):
@@ -165,7 +165,10 @@ class ImagePolicy(TD3Policy):
             gradients, while the actor's Q-term sees its features detached. Otherwise each has its
             own. (SB3's ``share_features_extractor`` trains a shared encoder by the actor's loss
             alone, and is refused here.)
+        q_trains_encoder: whether the actor's Q-term trains an encoder of the actor's own; if not,
+            behaviour cloning alone does.
         random_shift: largest shift of the augmentation, in pixels; 0 turns it off.
+        optimizer_kwargs: None is torch's fused Adam, three times faster on a CPU.
         **kwargs: the other arguments of SB3's ``TD3Policy``.
     """
 
@@ -177,7 +180,9 @@ class ImagePolicy(TD3Policy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         features_extractor_class: str | type[BaseFeaturesExtractor] = "conv",
         shared_encoder: bool = True,
+        q_trains_encoder: bool = True,
         random_shift: int = 4,
+        optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
         if kwargs.pop("share_features_extractor", False):
@@ -197,7 +202,10 @@ class ImagePolicy(TD3Policy):
                     f"use one of {', '.join(sorted(_ENCODERS))}, or a class"
                 )
             features_extractor_class = _ENCODERS[features_extractor_class]
+        if optimizer_kwargs is None and "optimizer_class" not in kwargs:
+            optimizer_kwargs = {"fused": True}
         self.shared_encoder = shared_encoder
+        self.q_trains_encoder = q_trains_encoder
         self.random_shift = random_shift
         super().__init__(
             observation_space,
@@ -205,6 +213,7 @@ class ImagePolicy(TD3Policy):
             lr_schedule,
             net_arch=[256, 256] if net_arch is None else net_arch,
             features_extractor_class=features_extractor_class,
+            optimizer_kwargs=optimizer_kwargs,
             **kwargs,
         )
 
@@ -230,7 +239,11 @@ class ImagePolicy(TD3Policy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         del data["share_features_extractor"]
-        data.update(shared_encoder=self.shared_encoder, random_shift=self.random_shift)
+        data.update(
+            shared_encoder=self.shared_encoder,
+            q_trains_encoder=self.q_trains_encoder,
+            random_shift=self.random_shift,
+        )
         return data
 
     def augment(self, observations: th.Tensor) -> th.Tensor:

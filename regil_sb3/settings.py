@@ -25,7 +25,10 @@ _NOT_SETTABLE = {
     *("env", "policy", "demo", "seed", "action_noise", "replay_buffer_class", "tensorboard_log"),
     "_init_setup_model",
 }
-_OWN = ("n_timesteps", "n_envs", "frame_stack", "policy", "env_kwargs", "env_wrapper")
+_OWN = (
+    *("n_timesteps", "n_envs", "frame_stack", "policy", "eval_episodes"),
+    *("env_kwargs", "env_wrapper"),
+)
 
 
 @dataclass
@@ -42,6 +45,7 @@ class Settings:
         n_envs: environments that step together.
         frame_stack: frames in an observation.
         policy: name of the policy.
+        eval_episodes: unseen episodes each time that the policy is evaluated during training.
         hyperparams: arguments of ``TD3BC``.
     """
 
@@ -52,6 +56,7 @@ class Settings:
     n_envs: int = 1
     frame_stack: int = 2
     policy: str = "CnnPolicy"
+    eval_episodes: int = 10
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     env_wrapper: list[Any] = field(default_factory=list)
     hyperparams: dict[str, Any] = field(default_factory=dict)
@@ -85,6 +90,13 @@ class Settings:
                 if name in arguments:
                     return arguments[name]
         return inspect.signature(RetrievalRewardWrapper).parameters[name].default
+
+    def plain(self) -> Settings:
+        """The same with the demonstrator's actions and pictures as they are: the plain guide."""
+        settings = copy.deepcopy(self)
+        for key, value in (("correction", "none"), ("register", False)):
+            _override(settings, key, value)
+        return settings
 
     def wrappers(self, demo: str) -> list[tuple[Any, dict[str, Any]]]:
         """Wrapper classes with their arguments, inner first; the retrieval ones get ``demo``.
@@ -159,7 +171,7 @@ def make_settings(
         _override(settings, key, value)
     if steps is not None:
         settings.steps = steps
-    for name in ("steps", "n_envs", "frame_stack"):
+    for name in ("steps", "n_envs", "frame_stack", "eval_episodes"):
         value = getattr(settings, name)
         if type(value) is not int or value < 1:
             raise ValueError(f"{name} is {value!r}: it must be a whole number of at least 1")
@@ -209,7 +221,7 @@ def _override(settings: Settings, key: str, value: Any) -> None:
     model = set(inspect.signature(TD3BC).parameters) - _NOT_SETTABLE
     wrappers = {n for c in RETRIEVAL.values() for n in inspect.signature(c).parameters}
     wrappers -= {"env", "demo"}
-    own = set(_OWN[:4])
+    own = set(_OWN[:5])
     if key.startswith("env_kwargs."):
         settings.env_kwargs[key.removeprefix("env_kwargs.")] = value
     elif key.startswith("policy_kwargs."):

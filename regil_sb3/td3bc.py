@@ -31,6 +31,7 @@ from stable_baselines3.td3.policies import MlpPolicy, MultiInputPolicy, TD3Polic
 from torch.nn import functional as F  # noqa: N812
 
 from regil_sb3.as_seen import as_seen
+from regil_sb3.bc_schedule import BySuccess, by_time
 from regil_sb3.policies import ImagePolicy
 from regil_sb3.relabelling import EpisodeRewards, episode_reward_class, rewards_come_late
 from regil_sb3.replay_buffer import FrameReplayBuffer
@@ -38,7 +39,11 @@ from regil_sb3.success_buffer import Observations, SuccessBuffer
 
 SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
 
-_CHOICES = {"bc_loss": ("mse", "nll"), "actor_q": ("min", "q1")}
+_CHOICES = {
+    "bc_loss": ("mse", "nll"),
+    "bc_schedule": ("time", "success"),
+    "actor_q": ("min", "q1"),
+}
 _NUMBER = (int, float)
 _RANGES: dict[str, tuple[tuple[type, ...], float, float]] = {
     "buffer_size": ((int,), 1, np.inf),
@@ -56,6 +61,7 @@ _RANGES: dict[str, tuple[tuple[type, ...], float, float]] = {
     "bc_floor": (_NUMBER, 0.0, 1.0),
     "bc_std": (_NUMBER, 1e-6, np.inf),
     "bc_pretrain_steps": ((int,), 0, np.inf),
+    "guide_noise": (_NUMBER, 0.0, np.inf),
     "success_buffer_size": ((int,), 1, np.inf),
     "q_coef": (_NUMBER, 0.0, np.inf),
     "exploration_std": (_NUMBER, 0.0, np.inf),
@@ -103,16 +109,25 @@ class TD3BC(TD3):
         target_policy_noise: std of the target's smoothing noise.
         target_noise_clip: its limit.
         warmup_steps: steps in which the guide acts. An episode begun in warm-up is finished in it.
+        guide_noise: std of Gaussian noise (clipped like exploration's) on the guide's scaled
+            actions when they are executed; the success buffer keeps them without, so that the
+            policy learns to come back (DART, https://arxiv.org/abs/1703.09327). Only for guides
+            that correct what they see, as ``RetrievalGuideWrapper(correction="servo")`` does.
         bc_coef: lambda at the start; 0 for no BC term.
         bc_floor: lambda's floor as a share of ``bc_coef``.
         bc_steps: steps until lambda would reach 0; None is the whole of ``learn``.
+        bc_schedule: "time" as above; "success": lambda falls only while the policy's own recent
+            episodes succeed about as often as ever, and rises where they do not.
         bc_loss: "mse" sums squared errors over action dimensions; "nll" is the Gaussian negative
             log likelihood with ``bc_std``, up to a constant.
         bc_std: std of that Gaussian, in actions scaled to [-1, 1].
         bc_pretrain_steps: updates of the actor by the BC term alone when the warm-up ends.
         success_buffer_size: steps in the success buffer, the demonstration's included.
+        keep_own_successes: whether the policy's own successful episodes go there too.
         actor_q: "min" of both critics in the actor's loss, or TD3's "q1".
         normalize_q: divide the actor's Q by the batch's mean absolute Q.
+        actor_in_warmup: whether the actor is updated while the guide still acts; if not, the critic
+            learns alone until then, and ``bc_pretrain_steps`` are the actor's first updates.
         q_coef: weight of Q in the actor's loss; 0 is behaviour cloning on the success buffer alone,
             and no critic gradient reaches the actor's encoder.
         reward_scale: factor on rewards when they are sampled (the replay buffer keeps them raw);
@@ -165,15 +180,19 @@ class TD3BC(TD3):
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.3,
         warmup_steps: int = 5_000,
+        guide_noise: float = 0.0,
         bc_coef: float = 2.0,
         bc_floor: float = 0.1,
         bc_steps: int | None = None,
+        bc_schedule: Literal["time", "success"] = "time",
         bc_loss: Literal["mse", "nll"] = "mse",
         bc_std: float = 0.1,
         bc_pretrain_steps: int = 1_000,
         success_buffer_size: int = 5_000,
+        keep_own_successes: bool = False,
         actor_q: Literal["min", "q1"] = "min",
         normalize_q: bool = True,
+        actor_in_warmup: bool = True,
         q_coef: float = 1.0,
         reward_scale: float | Literal["auto"] = "auto",
         exploration_std: float = 0.1,
@@ -204,6 +223,10 @@ class TD3BC(TD3):
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
         self.warmup_steps = warmup_steps
         self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps
+        self.guide_noise = guide_noise
+        self.bc_schedule = bc_schedule
+        self.keep_own_successes, self.actor_in_warmup = keep_own_successes, actor_in_warmup
+        self._by_success = BySuccess(bc_floor)
         self.bc_loss, self.bc_std, self.bc_pretrain_steps = bc_loss, bc_std, bc_pretrain_steps
         self.success_buffer_size = success_buffer_size
         self.actor_q, self.normalize_q, self.q_coef = actor_q, normalize_q, q_coef
@@ -359,7 +382,11 @@ class TD3BC(TD3):
         return result
 
     def _forget_open_episodes(self) -> None:
+        assert self.action_space.shape is not None
         self._succeeded = np.zeros(self.n_envs, bool)
+        self._demonstrates = np.zeros(self.n_envs, bool)  # an episode's first step tells
+        self._lengths = np.zeros(self.n_envs, int)
+        self._labels = np.zeros((self.n_envs, *self.action_space.shape), np.float32)
         self._episodes: list[list[tuple[Any, npt.NDArray[Any]]]] = [[] for _ in range(self.n_envs)]
         self._running = {k: np.zeros(self.n_envs) for k in ("env_reward", "retrieval_reward")}
 
@@ -382,20 +409,39 @@ class TD3BC(TD3):
         else:
             action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
             if self.exploration_std > 0 and action_noise is None:
-                noise = np.random.normal(0, self.exploration_std, buffer_action.shape)
-                noise = noise.clip(-self.exploration_clip, self.exploration_clip)
+                noise = self._clipped_noise(self.exploration_std, buffer_action.shape)
                 buffer_action = (buffer_action + noise).clip(-1, 1).astype(np.float32)
-                # float32 may put an unscaled bound outside by its last bit
-                action = self.policy.unscale_action(buffer_action)
-                action = action.clip(self.action_space.low, self.action_space.high)
+                action = self._unscaled(buffer_action)
         if self._guided.any():
             indices = np.flatnonzero(self._guided)
             suggested = np.stack(self.env.env_method("guide_action", indices=indices.tolist()))
             suggested = suggested.clip(self.action_space.low, self.action_space.high)
-            action[indices] = suggested
-            buffer_action[indices] = self.policy.scale_action(suggested)
+            self._labels[indices] = self.policy.scale_action(suggested)
+            executed = self._disturbed(self._labels)
+            action[indices] = self._unscaled(executed)[indices]
+            buffer_action[indices] = executed[indices]
         self._in_step = True
         return action, buffer_action
+
+    def _clipped_noise(self, std: float, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+        noise = np.random.normal(0, std, shape)
+        return noise.clip(-self.exploration_clip, self.exploration_clip)
+
+    def _unscaled(self, actions: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        assert isinstance(self.action_space, spaces.Box)
+        # float32 may put an unscaled bound outside by its last bit
+        low, high = self.action_space.low, self.action_space.high
+        unscaled: npt.NDArray[Any] = self.policy.unscale_action(actions)
+        return unscaled.clip(low, high, out=unscaled)
+
+    def _disturbed(self, labels: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """The guide's scaled actions as they are executed: noisy where they demonstrate."""
+        if self.guide_noise == 0:
+            return labels
+        noise = self._clipped_noise(self.guide_noise, labels.shape)
+        noise[~self._demonstrates] = 0
+        executed: npt.NDArray[np.float32] = (labels + noise).clip(-1, 1).astype(np.float32)
+        return executed
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: npt.NDArray[Any] | None = None
@@ -420,23 +466,30 @@ class TD3BC(TD3):
         before = self._last_obs
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         for i, info in enumerate(infos):
-            if self._guided[i]:
+            retrieval = info.get("retrieval", {})
+            self._demonstrates[i] = not retrieval.get("calibrating", False)
+            if self._guided[i] or self.keep_own_successes:
                 seen = (
                     {k: v[i].copy() for k, v in before.items()}
                     if isinstance(before, dict)
                     else np.array(before[i])  # type: ignore[index]
                 )
-                self._episodes[i].append((seen, buffer_action[i].copy()))
-            retrieval = info.get("retrieval", {})
+                done_here = self._labels[i] if self._guided[i] else buffer_action[i]
+                self._episodes[i].append((seen, done_here.copy()))
             self._running["env_reward"][i] += retrieval.get("env_reward", reward[i])
             late = np.sum(retrieval.get("episode_rewards", 0.0))
             self._running["retrieval_reward"][i] += reward[i] + late
+            self._lengths[i] += 1
             if dones[i]:
                 self._end_episode(i)
         self._in_step = False
 
     def _end_episode(self, env: int) -> None:
-        if self._guided[env] and self._succeeded[env]:
+        own = not self._guided[env]
+        if own:
+            part = self._lengths[env] / max(self._total_timesteps - self.warmup_steps, 1)
+            self._by_success.episode(bool(self._succeeded[env]), part)
+        if (self.keep_own_successes or not own) and self._kept(env):
             seen, actions = zip(*self._episodes[env], strict=True)
             observations: Observations = (
                 {k: np.stack([o[k] for o in seen]) for k in seen[0]}
@@ -455,8 +508,13 @@ class TD3BC(TD3):
             del self._returns[name][: -self._stats_window_size]
             running[env] = 0.0
         self._episodes[env] = []
+        self._lengths[env] = 0
+        self._demonstrates[env] = False
         self._succeeded[env] = False
         self._guided[env] = self.num_timesteps < self.warmup_steps
+
+    def _kept(self, env: int) -> bool:
+        return bool(self._succeeded[env] and self._demonstrates[env] and self._episodes[env])
 
     def _check_finite(self, reward: npt.NDArray[Any], new_obs: Any) -> None:
         values = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}
@@ -483,8 +541,10 @@ class TD3BC(TD3):
 
     def bc_coef_now(self) -> float:
         """lambda(t) at the present step."""
+        if self.bc_schedule == "success":
+            return self.bc_coef * self._by_success.share
         steps = self.bc_steps if self.bc_steps is not None else max(self._total_timesteps, 1)
-        return self.bc_coef * max(1.0 - self.num_timesteps / steps, self.bc_floor)
+        return self.bc_coef * by_time(self.num_timesteps, steps, self.bc_floor)
 
     def _bc_term(self) -> th.Tensor:
         """Behaviour-cloning loss of a batch of the success buffer, a scalar."""
@@ -560,6 +620,7 @@ class TD3BC(TD3):
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         shared = self.critic.features_extractor is self.actor.features_extractor
+        trains_actor = self.actor_in_warmup or not self.guided
 
         actor_losses, critic_losses, bc_losses = [], [], []
         for _ in range(self._number_of_updates(gradient_steps)):
@@ -602,7 +663,7 @@ class TD3BC(TD3):
             self.critic.optimizer.step()
 
             # Delayed actor, Eq. 4
-            if self._n_updates % self.policy_delay == 0:
+            if self._n_updates % self.policy_delay == 0 and trains_actor:
                 actor_loss = th.zeros((), device=self.device)
                 if self.q_coef > 0:
                     # A shared encoder is trained by critic and BC term: here its features are fixed
@@ -610,9 +671,9 @@ class TD3BC(TD3):
                         features = (
                             features.detach() if shared else encode(self.critic, observations)
                         )
-                    actions = self.actor.mu(
-                        features if shared else encode(self.actor, observations)
-                    )
+                    with th.set_grad_enabled(getattr(self.policy, "q_trains_encoder", True)):
+                        seen = features if shared else encode(self.actor, observations)
+                    actions = self.actor.mu(seen)
                     q = self._actor_q(features, actions)
                     scale = q.abs().mean().detach().clamp(min=1e-8) if self.normalize_q else 1.0
                     actor_loss = -self.q_coef * q.mean() / scale
@@ -626,6 +687,7 @@ class TD3BC(TD3):
                 actor_loss.backward()  # type: ignore[no-untyped-call]
                 self.actor.optimizer.step()
 
+            if self._n_updates % self.policy_delay == 0:
                 polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
                 # A shared target encoder has moved with the critic's
                 own = self.actor.mu if shared else self.actor
@@ -680,6 +742,9 @@ class TD3BC(TD3):
             "_episodes",
             "_guided",
             "_succeeded",
+            "_demonstrates",
+            "_lengths",
+            "_labels",
             "_running",
             "_returns",
         ]

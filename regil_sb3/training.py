@@ -4,15 +4,18 @@
 - ``TrainingCallback``: progress, evaluation on the selection seeds, the models on disk.
 - ``train``, ``resume``: learn in a run folder.
 - ``evaluate_run``: policy, guided replay and behaviour cloning on the same unseen seeds.
+- ``keep_freed_memory``, ``set_threads``: what makes updates on a CPU fast.
 """
 
 from __future__ import annotations
 
 import csv
+import ctypes
 import json
 import os
+import platform
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from io import BufferedWriter
 from pathlib import Path
 from typing import Any
@@ -42,7 +45,6 @@ from regil_sb3.success_buffer import SuccessBuffer
 from regil_sb3.td3bc import TD3BC
 
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
-SELECTION_EPISODES = 10  # each time the policy is evaluated during training
 
 
 def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEnv:
@@ -137,6 +139,7 @@ class TrainingCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         if self._first and self._td3bc.pretrained:
+            save_calibration(self.training_env, self.run / "calibration.json")
             self._evaluate()
             self._first = False
 
@@ -147,6 +150,7 @@ class TrainingCallback(BaseCallback):
             self._describe()
         self.logger.record("time/frames", self.num_timesteps * self._repeat)
         if self.num_timesteps >= self._next:
+            save_calibration(self.training_env, self.run / "calibration.json")
             if not model.guided:
                 self._evaluate()
             else:
@@ -200,6 +204,32 @@ def save_model(model: TD3BC, path: Path) -> None:
     """Save a model; the old file stays until the new one is complete."""
     with _replacing(path) as file:
         model.save(file)
+
+
+def save_calibration(env: VecEnv, path: Path) -> None:
+    """Keep what a correcting guide has learned; nothing where there is none yet."""
+    if not env.has_attr("calibration"):
+        return
+    found = [c for c in env.env_method("calibration") if c is not None]
+    if found:
+        with _replacing(path) as file:
+            file.write(json.dumps(found[0], indent=1).encode())
+
+
+def load_calibration(env: VecEnv, path: Path) -> bool:
+    """Give every guide what ``save_calibration`` kept; whether there was such a file.
+
+    Raises:
+        ValueError: the file is damaged, or from another camera.
+    """
+    if not path.exists():
+        return False
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is damaged ({error}): remove it") from error
+    env.env_method("set_calibration", found)
+    return True
 
 
 def _save_buffers(model: TD3BC, path: Path) -> None:
@@ -292,6 +322,7 @@ def resume(run: Path) -> Settings:
     with _environments(settings, run / "demo.hdf5") as (env, eval_env):
         model = TD3BC.load(run / "model.zip", env=env, demo=Demonstration.load(run / "demo.hdf5"))
         _load_buffers(model, run / "buffers.npz")
+        load_calibration(env, run / "calibration.json")
         _learn(model, settings, run, eval_env)
     return settings
 
@@ -299,7 +330,7 @@ def resume(run: Path) -> Settings:
 def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> None:
     every = max(settings.steps // 6, 1)
     # The callback reads the log before it is reopened
-    callback = TrainingCallback(run, eval_env, every, SELECTION_EPISODES)
+    callback = TrainingCallback(run, eval_env, every, settings.eval_episodes)
     formats = [_AppendingCSV(run / "progress.csv"), TensorBoardOutputFormat(str(run))]
     model.set_logger(Logger(str(run), formats))
     fresh = model.num_timesteps == 0
@@ -308,6 +339,8 @@ def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> Non
     except KeyboardInterrupt:
         save_model(model, run / "model.zip")
         _save_buffers(model, run / "buffers.npz")
+        assert model.env is not None
+        save_calibration(model.env, run / "calibration.json")
         raise
     else:
         save_model(model, run / "model.zip")
@@ -339,7 +372,7 @@ def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int)
 
 
 def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
-    """Evaluate a run's last model, guided replay and BC, and write ``evaluation.json``.
+    """Evaluate a run's last and best model, both guides and BC, and write ``evaluation.json``.
 
     BC is trained here when the folder has no ``bc_model.zip`` yet.
 
@@ -357,8 +390,10 @@ def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
     if not (run / "model.zip").exists():
         raise ValueError(f"{run} has no model.zip yet: train it first")
     demo = Demonstration.load(run / "demo.hdf5")
-    env = make_env(settings, run / "demo.hdf5", n_envs=1)
-    try:
+    with (
+        closing(make_env(settings, run / "demo.hdf5", n_envs=1)) as env,
+        closing(make_env(settings.plain(), run / "demo.hdf5", n_envs=1)) as plain_env,
+    ):
         model = TD3BC.load(run / "model.zip", buffer_size=1)
         if (run / "bc_model.zip").exists():
             bc = TD3BC.load(run / "bc_model.zip", buffer_size=1)
@@ -369,23 +404,27 @@ def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
             "steps": model.num_timesteps,
             "frames": model.num_timesteps * action_repeat(env),
         }
-        acts: list[tuple[str, Act]] = [("policy", policy_act(model)), ("bc", policy_act(bc))]
-        if env.has_attr("guide_action"):
-            acts.insert(1, ("guide", guide_act))
-        for name, act in acts:
+        acts: list[tuple[str, Act, VecEnv]] = [("policy", policy_act(model), env)]
+        if (run / "best_model.zip").exists():
+            best = TD3BC.load(run / "best_model.zip", buffer_size=1)
+            acts.append(("best_policy", policy_act(best), env))
+        if plain_env.has_attr("guide_action"):
+            acts.append(("guide", guide_act, plain_env))
+        if load_calibration(env, run / "calibration.json"):
+            acts.append(("corrected_guide", guide_act, env))
+        acts.append(("bc", policy_act(bc), env))
+        for name, act, where in acts:
             with tqdm(total=episodes, desc=f"evaluating {name}", dynamic_ncols=True) as bar:
 
                 def show(result: Evaluation, bar: Any = bar) -> None:
                     bar.set_postfix_str(f"success {np.mean(result.successes):.2f}", refresh=False)
                     bar.update(1)
 
-                result = evaluate(act, env, episodes, EVALUATION_SEED, show)
+                result = evaluate(act, where, episodes, EVALUATION_SEED, show)
             results[name] = result.as_dict()
             if name == "policy":
                 policy_result = result
         results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
-    finally:
-        env.close()
     with _replacing(run / "evaluation.json") as file:
         file.write(json.dumps(results, indent=1).encode())
     episode = policy_result.first_episode({**demo.metadata, "seed": EVALUATION_SEED})
@@ -398,3 +437,16 @@ def set_threads() -> None:
     """Let OMP_NUM_THREADS decide, where it is set, over torch's own choice."""
     if os.environ.get("OMP_NUM_THREADS"):
         th.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+
+
+def keep_freed_memory() -> None:
+    """Stop glibc from handing freed tensors back to the system and asking for them again.
+
+    An update on a CPU frees and allocates tensors of up to 11 MB many times. Each page that comes
+    back from the system costs a page fault, altogether a quarter of the update
+    (docs/performance.md). At most 256 MiB of freed memory are kept. Without glibc nothing happens.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+        mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD: the most that glibc accepts
+        mallopt(-1, 256 << 20)  # M_TRIM_THRESHOLD

@@ -374,3 +374,73 @@ def test_bad_combinations():
     pendulum = TD3BC("MlpPolicy", "Pendulum-v1", **TD3_OWN, **{**OFF, "warmup_steps": 10})
     with pytest.raises(ValueError, match="needs a guide"):
         pendulum.learn(20)
+
+
+def test_guide_noise_is_executed_but_not_cloned():
+    envs = [Reach() for _ in range(2)]
+    env = VecFrameStack(DummyVecEnv([lambda e=e: e for e in envs]), 2)
+    model = small(env, guide_noise=0.2, warmup_steps=150, learning_starts=1_000)
+    model.learn(100)
+    executed = model.replay_buffer.actions[: model.replay_buffer.total]
+    for i, one in enumerate(envs):
+        np.testing.assert_allclose(executed[:, i], np.stack(one.executed), atol=1e-6)
+    assert executed[..., 1].std() > 0.05  # the guide's own second action is always .1
+    _, cloned = model.success_buffer.sample(300)
+    np.testing.assert_allclose(cloned[:, 1], 0.1, atol=1e-6)
+
+
+def test_episodes_that_calibrate_are_not_kept(monkeypatch):
+    def calibrating(self, action, step=Reach.step):
+        *rest, info = step(self, action)
+        info["retrieval"]["calibrating"] = True
+        return *rest, info
+
+    monkeypatch.setattr(Reach, "step", calibrating)
+    model = small(stacked(), guide_noise=0.2)
+    model.learn(55)
+    assert model.success_buffer.episodes == 1  # the demonstration
+    guided = model.replay_buffer.actions[: model.replay_buffer.total, 0, 1]
+    np.testing.assert_allclose(guided, 0.1, atol=1e-6)  # and they are not disturbed
+
+
+def test_own_successes_are_kept_where_asked():
+    for keep, more in ((False, False), (True, True)):
+        model = small(stacked(), keep_own_successes=keep, warmup_steps=20, bc_pretrain_steps=200)
+        model.learn(30)
+        guided = model.success_buffer.episodes
+        model.learn(150, reset_num_timesteps=False)
+        assert (model.success_buffer.episodes > guided) == more
+        assert np.mean(model.ep_success_buffer) > 0
+
+
+def test_actor_rests_in_warmup_where_asked():
+    model = small(stacked(), actor_in_warmup=False, bc_pretrain_steps=0, warmup_steps=60)
+    before = [p.clone() for p in model.actor.mu.parameters()]
+    critic = [p.clone() for p in model.critic.qf0.parameters()]
+    model.learn(50)
+    assert model._n_updates > 0
+    assert all(th.equal(a, b) for a, b in zip(before, model.actor.mu.parameters(), strict=True))
+    assert not all(
+        th.equal(a, b) for a, b in zip(critic, model.critic.qf0.parameters(), strict=True)
+    )
+    model.learn(60, reset_num_timesteps=False)
+    assert not all(th.equal(a, b) for a, b in zip(before, model.actor.mu.parameters(), strict=True))
+
+
+def test_q_leaves_an_encoder_of_the_actors_own_alone_where_asked():
+    for trains in (True, False):
+        kwargs = {"shared_encoder": False, "q_trains_encoder": trains}
+        model = small(stacked(), demo=None, bc_coef=0.0, warmup_steps=0, policy_kwargs=kwargs)
+        before = [p.clone() for p in model.actor.features_extractor.parameters()]
+        model.learn(60)
+        after = model.actor.features_extractor.parameters()
+        assert all(th.equal(a, b) for a, b in zip(before, after, strict=True)) != trains
+
+
+def test_lambda_by_success_is_saved_with_the_model(tmp_path):
+    model = small(stacked(), bc_schedule="success", warmup_steps=20, bc_pretrain_steps=200)
+    model.learn(400)
+    assert model.bc_coef_now() < model.bc_coef
+    model.save(tmp_path / "model.zip")
+    again = TD3BC.load(tmp_path / "model.zip", buffer_size=10)
+    assert again.bc_coef_now() == model.bc_coef_now()

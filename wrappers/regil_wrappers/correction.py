@@ -36,6 +36,7 @@ _SETTLE = 0.1  # s that a calibration move is given to come to rest
 _RELEASE = (10, 12)  # steps after the gripper closes: the correction starts to fade; fades over
 _WORST_RATIO = 0.95  # a registration that explains less is not believed
 _FARTHEST = 3.5  # displacements beyond this many times the plane's largest std are not believed
+_DISTURBED = 0.5  # of a full action: a replay that was disturbed by no more is a replay
 _STILL = 0.5  # px at 84 pixels: a pair of calibration pictures that shifted less says nothing
 
 # Successes and failures that each way of replaying starts with, Beta(a, b): what is usually best is
@@ -197,14 +198,18 @@ class Servo:
         clipped: NDArray[np.float32] = np.clip(action, self._low, self._high)
         return clipped
 
-    def executed(self, action: NDArray[np.float32], picture: Picture) -> None:
-        """What was done, whoever chose it, and the picture that followed."""
-        suggested = self.action()
-        followed = suggested is None or np.allclose(action, suggested, atol=1e-4)
-        self._followed = self._followed and bool(followed)
+    def executed(
+        self, action: NDArray[np.float32], suggested: NDArray[np.float32], picture: Picture
+    ) -> None:
+        """What was done, whoever chose it, what the guide had suggested, and what was seen then.
+
+        A replay may be disturbed by noise; calibration moves may not.
+        """
+        off = float((np.abs(action - suggested) / np.maximum(self._high, 1e-9)).max())
+        self._followed = self._followed and off <= _DISTURBED
         if self._segment is not None:
             self._calibrated_here = True
-            if not followed:  # somebody else acts: no calibration in this episode
+            if off > 1e-3:  # somebody else acts: no calibration in this episode
                 self._segment, self._way = None, self._plain()
                 return
             self._calibration_step(self._segment, picture)

@@ -300,12 +300,14 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step with the given action; ``info["retrieval"]`` holds the guide's for the next step."""
+        suggested = self.guide_action()
         observation, reward, terminated, truncated, info = super().step(action)
         advanced = self.alignment.end > self._furthest
         self._furthest = max(self._furthest, self.alignment.end)
         self._waiting = 0 if advanced else self._waiting + 1
         if self._servo is not None:
-            self._servo.executed(np.asarray(action, np.float32), self.retrieval_frame)
+            executed = np.asarray(action, np.float32)
+            self._servo.executed(executed, suggested, self.retrieval_frame)
             if terminated or truncated:
                 self._servo.finish(bool(info.get("is_success", terminated)))
         info = self._with_retrieval(info, **self._guidance())
