@@ -193,13 +193,21 @@ def main(table: str) -> list[Row]:
     """Measure a table and print it.
 
     Args:
-        table: one of `TABLES`.
+        table: one of `TABLES`, or "ranking" (`regil_sb3.bench_rewards`).
+
+    Returns:
+        its rows; none for "ranking".
 
     Raises:
         ValueError: where there is no such table.
     """
+    if table == "ranking":  # of episodes, not of times
+        from regil_sb3 import bench_rewards
+
+        bench_rewards.main()
+        return []
     if table not in TABLES:
-        raise ValueError(f"table {table!r} is not one of {', '.join(TABLES)}")
+        raise ValueError(f"table {table!r} is not one of {', '.join([*TABLES, 'ranking'])}")
     rows = TABLES[table]()
     width = max(len(row.what) for row in rows)
     print(f"{table:{width}}  median ms  times the first")

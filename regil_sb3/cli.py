@@ -86,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("-o", "--out", type=Path, help="file (RUN/report.html)")
 
     bench = commands.add_parser("bench", help="measure, as ratios in one run")
-    bench.add_argument("table", help="retrieval or rendering")
+    bench.add_argument("table", help="retrieval, rendering or ranking")
     return parser
 
 

@@ -33,6 +33,7 @@ from torch.nn import functional as F  # noqa: N812
 from regil_sb3.as_seen import as_seen
 from regil_sb3.bc_schedule import BySuccess, by_time
 from regil_sb3.policies import ImagePolicy
+from regil_sb3.relabelling import EpisodeRewards, episode_reward_class, rewards_come_late
 from regil_sb3.replay_buffer import FrameReplayBuffer
 from regil_sb3.success_buffer import Observations, SuccessBuffer
 
@@ -98,7 +99,8 @@ class TD3BC(TD3):
         gradient_steps: updates each time; a float is updates per *transition*, all environments
             counted: 0.5 makes one update for every two transitions.
         action_noise: SB3's own; replaces ``exploration_std``.
-        replay_buffer_class: None chooses ``FrameReplayBuffer`` for images, else SB3's.
+        replay_buffer_class: None chooses ``FrameReplayBuffer`` for images, else SB3's; their twins
+            of ``regil_sb3.relabelling`` where rewards come at the episode's end.
         replay_buffer_kwargs: for ``replay_buffer_class``.
         optimize_memory_usage: SB3's own; images never need it.
         n_steps: length of n-step returns; dict observations need 1.
@@ -279,20 +281,24 @@ class TD3BC(TD3):
                 "buffer: set n_steps=1"
             )
         chosen = self.replay_buffer_class
-        if chosen is None and is_image_space(space):
+        late = self.env is not None and rewards_come_late(self.env)
+        if chosen is None and (late or is_image_space(space)):
+            buffer = episode_reward_class(space, self.n_steps) if late else FrameReplayBuffer
+            own: dict[str, Any] = (
+                {"n_stack": self.n_stack}
+                if is_image_space(space)
+                else {"optimize_memory_usage": self.optimize_memory_usage}
+            )
+            if is_image_space(space) or self.n_steps > 1:
+                own |= {"n_steps": self.n_steps, "gamma": self.gamma}
             # TD3's set-up would warn that n_steps is ignored for a class of one's own
-            self.replay_buffer = FrameReplayBuffer(  # type: ignore[assignment]
+            self.replay_buffer = buffer(  # type: ignore[assignment]
                 self.buffer_size,
                 space,
                 self.action_space,
                 self.device,
                 self.n_envs,
-                **{
-                    "n_stack": self.n_stack,
-                    "n_steps": self.n_steps,
-                    "gamma": self.gamma,
-                    **self.replay_buffer_kwargs,
-                },
+                **(own | self.replay_buffer_kwargs),
             )
         self.success_buffer = SuccessBuffer(
             self.success_buffer_size, self.n_stack if is_image_space(space) else 1
@@ -348,6 +354,11 @@ class TD3BC(TD3):
                 self.used_reward_scale = own * 10.0 * (1.0 - self.gamma)
         else:
             self.used_reward_scale = float(self.reward_scale)
+        if rewards_come_late(self.env) and not isinstance(self.replay_buffer, EpisodeRewards):
+            raise ValueError(
+                "the environment's rewards come at the episode's end, and this replay buffer would "
+                "serve placeholders: use one of regil_sb3.relabelling"
+            )
         if self._in_step:  # interrupted there: the environment is ahead of the replay buffer
             self._last_obs, self._in_step = None, False
         begins_anew = reset_num_timesteps or self._last_obs is None
@@ -449,7 +460,8 @@ class TD3BC(TD3):
                 done_here = self._labels[i] if self._guided[i] else buffer_action[i]
                 self._episodes[i].append((seen, done_here.copy()))
             self._running["env_reward"][i] += retrieval.get("env_reward", reward[i])
-            self._running["retrieval_reward"][i] += reward[i]
+            late = np.sum(retrieval.get("episode_rewards", 0.0))
+            self._running["retrieval_reward"][i] += reward[i] + late
             self._lengths[i] += 1
             if dones[i]:
                 self._end_episode(i)
@@ -585,6 +597,9 @@ class TD3BC(TD3):
                 self.pretrain_bc(self.bc_pretrain_steps)
             self.pretrained = True
 
+        assert self.replay_buffer is not None
+        if not self.replay_buffer.size():  # no episode has ended, whose rewards come then
+            return
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         shared = self.critic.features_extractor is self.actor.features_extractor
@@ -593,7 +608,6 @@ class TD3BC(TD3):
         actor_losses, critic_losses, bc_losses = [], [], []
         for _ in range(self._number_of_updates(gradient_steps)):
             self._n_updates += 1
-            assert self.replay_buffer is not None
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
             observations = self._augmented(replay_data.observations)

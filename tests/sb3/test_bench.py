@@ -25,5 +25,7 @@ def test_table_is_printed(monkeypatch, capsys):
 
 
 def test_unknown_table_gets_one_line():
-    with pytest.raises(ValueError, match=r"^table 'speed' is not one of rendering, retrieval$"):
+    with pytest.raises(
+        ValueError, match=r"^table 'speed' is not one of rendering, retrieval, ranking$"
+    ):
         bench.main("speed")

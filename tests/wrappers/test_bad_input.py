@@ -177,7 +177,7 @@ def test_settings_of_both(
 @pytest.mark.parametrize(
     ("wrapper", "settings", "message"),
     [
-        (RetrievalRewardWrapper, {"reward": "ot"}, r"reward='ot': choose one of \['sdtw"),
+        (RetrievalRewardWrapper, {"reward": "dtw"}, r"reward='dtw': choose one of \['sdtw"),
         (RetrievalRewardWrapper, {"mode": "both"}, "mode='both'"),
         (RetrievalRewardWrapper, {"weight": float("nan")}, "weight=nan"),
         (RetrievalRewardWrapper, {"divisor": 5}, "divisor=5"),

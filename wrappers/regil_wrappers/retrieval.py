@@ -161,6 +161,7 @@ class Retriever:
             )
         candidates = nearest(distances, self.k).tolist()
         self._append(distances)
+        self._embedding = embedding
         q_star = candidates[-1]
         self._table = accumulated_costs(
             self._rows[self._top : self._bottom, : q_star + 1], self.step_pattern
@@ -187,6 +188,27 @@ class Retriever:
         self._rows[self._bottom] = distances
         self._bottom += 1
         self._steps += 1
+
+    @property
+    def embedding(self) -> NDArray[np.float32]:
+        """(D,) float32: the current frame's.
+
+        Raises:
+            ValueError: before the first step of an episode.
+        """
+        _ = self.alignment
+        return self._embedding
+
+    @property
+    def distances(self) -> NDArray[np.float64]:
+        """(N,) float64: squared distance of the current frame to each of the demonstration.
+
+        Raises:
+            ValueError: before the first step of an episode.
+        """
+        _ = self.alignment
+        distances: NDArray[np.float64] = self._rows[self._bottom - 1].copy()
+        return distances
 
     def end_costs(self) -> NDArray[np.float64]:
         """D(H+1, j) / window for every frame j, (N,) float64: the best cost of ending there.

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import os
-from functools import cached_property
 from typing import Any, Literal, SupportsFloat, cast
 
 import gymnasium as gym
@@ -28,11 +27,10 @@ from regil_wrappers.encoders import Encoder, make_encoder
 from regil_wrappers.frames import FrameSource, check_recorded_settings
 from regil_wrappers.registration import Displacement, moved_back, register
 from regil_wrappers.retrieval import Alignment, Retriever, check_settings
-from regil_wrappers.rewards import arc_length, demonstration_tau, progress_reward, sdtw_reward
+from regil_wrappers.reward_signals import AT_EPISODE_END, AT_EVERY_STEP, make_signal
+from regil_wrappers.rewards import episode_scale
 
 __all__ = ["RetrievalGuideWrapper", "RetrievalRewardWrapper"]
-
-_REWARDS = ("sdtw", "progress")
 
 
 class _RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
@@ -367,11 +365,25 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
 class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
     """Rewards following the demonstration.
 
-    "sdtw", the paper's: r = -(S-DTW cost) / (frames in the window), Eq. 3: 0 along an exact replay
-    and negative otherwise. "progress": r = max_j phi_j exp(-C(j) / tau) - 1, in (-1, 0], which
-    rises along the demonstration (`regil_wrappers.rewards.progress_reward`). Both depend on nothing
-    that comes later. Observations pass through. ``info["retrieval"]`` holds ``start``, ``end``
-    (frames of the demonstration), ``cost`` and ``env_reward``, the environment's own.
+    Known at every step, from nothing that comes later (`regil_wrappers.rewards`):
+
+    * "sdtw", the paper's: r = -(S-DTW cost) / (frames in the window), Eq. 3: 0 along an exact
+      replay and negative otherwise
+    * "progress": r = max_j phi_j exp(-C(j) / tau) - 1, in (-1, 0], rises along the demonstration
+    * "cos": cosine similarity with the nearest frame, in [-1, 1]
+    * "orca": ordered coverage of the demonstration's frames, in [0, 1]
+    * "pwil": greedy transport, in [0, 5]; an episode longer than the demonstration earns 0 then
+
+    Known at the episode's end: "ot" and "tot", (temporal) optimal transport. Each step then returns
+    0 (with ``mode="add"`` the environment's reward), and ``info`` of the last one holds what is to
+    be *added* to the rewards that were returned: ``info["retrieval"]["episode_rewards"]``, (steps,)
+    float32, weighted, times ``episode_scale`` of the first episode of all (ROT's 10 / |sum|,
+    unweighted). An algorithm that does not read it learns from zeros: with Stable-Baselines3 use
+    ``regil_sb3.relabelling``'s replay buffers. Time limits belong inside this wrapper.
+
+    Positive rewards pay for every step survived: where success ends the episode they teach not to
+    finish. Observations pass through. ``info["retrieval"]`` holds ``start``, ``end`` (frames of the
+    demonstration), ``cost`` and ``env_reward``, the environment's own.
 
     Example:
         >>> import gymnasium as gym
@@ -393,11 +405,11 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
         horizon: H, how many frames before the current one are aligned with it.
         image: where frames come from: "obs" (the observation is the picture), "obs:KEY" (a key of a
             dict observation) or "render" (``env.render()``, with ``render_mode="rgb_array"``).
-        reward: "sdtw" or "progress".
+        reward: "sdtw", "progress", "cos", "orca", "pwil", "ot" or "tot".
         mode: "replace" the environment's reward, or "add" to it.
         weight: factor of this reward.
-        divisor: "window" divides by the frames in the window, "horizon" always by H + 1 as the
-            paper does; they differ in the first H steps of an episode.
+        divisor: of "sdtw": "window" divides by the frames in the window, "horizon" always by H + 1
+            as the paper does; they differ in the first H steps of an episode.
         step_pattern: "symmetric" (Eq. 1) or "strap".
         register: whether pictures are moved back, once an episode has shown how far the target
             stands from where it stood in the demonstration, before they are aligned.
@@ -416,7 +428,7 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
         k: int = 5,
         horizon: int = 4,
         image: str = "obs",
-        reward: Literal["sdtw", "progress"] = "sdtw",
+        reward: Literal["sdtw", "progress", "cos", "orca", "pwil", "ot", "tot"] = "sdtw",
         mode: Literal["replace", "add"] = "replace",
         weight: float = 1.0,
         divisor: Literal["window", "horizon"] = "window",
@@ -426,7 +438,7 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
         settings = _settings(demo, encoder, k, horizon, image, step_pattern, register)
         loaded, frames = _checked(env, settings)
         for name, value, choices in (
-            ("reward", reward, _REWARDS),
+            ("reward", reward, (*AT_EVERY_STEP, *AT_EPISODE_END)),
             ("mode", mode, ("replace", "add")),
             ("divisor", divisor, ("window", "horizon")),
         ):
@@ -449,45 +461,46 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
         self.mode = mode
         self.weight = weight
         self.reward = reward
-        self._divided_by_horizon = horizon if divisor == "horizon" else None
+        self._signal = make_signal(
+            reward, self.retriever, horizon if divisor == "horizon" else None
+        )
 
-    @cached_property
+    @property
     def reward_scale(self) -> float:
-        """The reward's own scale: 1 / tau of the demonstration for "sdtw", 1 for "progress".
+        """What makes a typical step's reward about 1 in size, from the demonstration alone.
+
+        1 / tau for "sdtw", 1 / 5 for "pwil", 1 for "progress", "cos" and "orca"; for "ot" and "tot"
+        frames / 10, once they are times ``episode_scale``.
 
         Raises:
             ValueError: if the demonstration does not move.
         """
-        return 1 / self._tau if self.reward == "sdtw" else 1.0
+        return self._signal.scale
 
-    @cached_property
-    def _tau(self) -> float:
-        return demonstration_tau(self.retriever.embeddings)
-
-    @cached_property
-    def _phi(self) -> NDArray[np.float64]:
-        return arc_length(self.retriever.embeddings)
-
-    def _retrieval_reward(self) -> float:
-        if self.reward == "sdtw":
-            return sdtw_reward(self.alignment, self._divided_by_horizon)
-        return progress_reward(self.retriever.end_costs(), self._phi, self._tau)
+    @property
+    def rewards_at_episode_end(self) -> bool:
+        """Whether the rewards come with the last step's ``info``, and steps return placeholders."""
+        return self.reward in AT_EPISODE_END
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ObsType, dict[str, Any]]:
         """Reset; ``info["retrieval"]`` holds the alignment of the first frame."""
         observation, info = super().reset(seed=seed, options=options)
+        self._signal.begin()
         return observation, self._with_retrieval(info)
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step; the environment's own reward goes to ``info["retrieval"]["env_reward"]``."""
         observation, env_reward, terminated, truncated, info = super().step(action)
-        reward = self.weight * self._retrieval_reward()
+        reward = self.weight * self._signal.step()
         if self.mode == "add":
             reward += float(env_reward)
-        info = self._with_retrieval(info, env_reward=float(env_reward))
-        return observation, reward, terminated, truncated, info
+        own: dict[str, Any] = {"env_reward": float(env_reward)}
+        if (terminated or truncated) and (late := self._signal.end()) is not None:
+            own["episode_rewards"] = (self.weight * late).astype(np.float32)
+            own["episode_scale"] = episode_scale(late)
+        return observation, reward, terminated, truncated, self._with_retrieval(info, **own)
 
 
 def _settings(
