@@ -23,7 +23,7 @@ from regil_sb3.policies import ConvEncoder, random_shift
 from regil_sb3.training import keep_freed_memory
 
 SPACE = spaces.Box(0, 255, (6, 84, 84), np.uint8)
-ROUNDS = 30
+ROUNDS = 20
 
 
 class SpaceToDepth(ConvEncoder):
@@ -130,11 +130,11 @@ def make_model(dtype):
         bc_coef=0,
         warmup_steps=0,
         gradient_steps=0,
-        buffer_size=2_000,
+        buffer_size=500,
         policy_kwargs={"features_extractor_kwargs": {"dtype": dtype}},
     )
-    model.learn(2_000)
-    for _ in range(10):
+    model.learn(500)
+    for _ in range(5):
         observations = np.random.randint(0, 256, (100, *SPACE.shape), np.uint8)
         actions = np.random.uniform(-1, 1, (100, 4)).astype(np.float32)
         model.success_buffer.add(observations, actions)
@@ -163,7 +163,7 @@ if __name__ == "__main__":
         sys.exit()
     print("| freed memory | convolutions | TD3BC update | BC update | page faults |")
     print("|---|---|---|---|---|", flush=True)
-    for memory in ("returned", "kept") * 2:
+    for memory in ("returned", "kept"):
         subprocess.run([sys.executable, __file__, memory], check=True)
     keep_freed_memory()
     convolutions()

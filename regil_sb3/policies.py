@@ -79,8 +79,8 @@ class ConvEncoder(_Encoder):
     Args:
         observation_space: images, channels first, at least 36 pixels high and wide.
         features_dim: length of the feature vector.
-        dtype: "float32", or "bfloat16" for the convolutions (the weights stay float32): half the
-            time on a CPU that has instructions for it, many times slower on one that has not.
+        dtype: "float32", or "bfloat16" for the convolutions alone; weights stay float32. Faster on
+            a CPU that has instructions for it, several times slower on one that has not.
     """
 
     def __init__(
@@ -136,8 +136,8 @@ class ResNet18Encoder(_Encoder):
     Args:
         observation_space: images, channels first.
         features_dim: length of the feature vector.
-        dtype: "float32", or "bfloat16" for the convolutions (the weights stay float32): half the
-            time on a CPU that has instructions for it, many times slower on one that has not.
+        dtype: "float32", or "bfloat16" for the convolutions alone; weights stay float32. Faster on
+            a CPU that has instructions for it, several times slower on one that has not.
     """
 
     def __init__(
