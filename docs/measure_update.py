@@ -101,7 +101,9 @@ def convolutions():
 
 def small_parts(model):
     batch = th.from_numpy(SPACE.sample()).expand(64, *SPACE.shape).contiguous()
-    parameters = list(model.critic.parameters())
+    parameters = [nn.Parameter(p.detach().clone()) for p in model.critic.parameters()]
+    for parameter in parameters:
+        parameter.grad = th.ones_like(parameter)
     adam = {
         f"Adam, {name}": th.optim.Adam(parameters, lr=1e-9, **kwargs).step
         for name, kwargs in {
@@ -129,6 +131,7 @@ def make_model(dtype):
         env,
         bc_coef=0,
         warmup_steps=0,
+        bc_pretrain_steps=0,
         gradient_steps=0,
         buffer_size=500,
         policy_kwargs={"features_extractor_kwargs": {"dtype": dtype}},
@@ -163,7 +166,7 @@ if __name__ == "__main__":
         sys.exit()
     print("| freed memory | convolutions | TD3BC update | BC update | page faults |")
     print("|---|---|---|---|---|", flush=True)
-    for memory in ("returned", "kept"):
+    for memory in ("returned", "kept") * 2:
         subprocess.run([sys.executable, __file__, memory], check=True)
     keep_freed_memory()
     convolutions()
