@@ -1,4 +1,4 @@
-"""Augmentation and optimizer of the image policies, against numpy's padding and plain Adam."""
+"""Image policies: augmentation against numpy, fused against plain Adam, bfloat16 encoder."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from regil_sb3.policies import ImagePolicy, random_shift
+from regil_sb3.policies import ConvEncoder, ImagePolicy, random_shift
 
 IMAGES = spaces.Box(0, 255, (3, 40, 40), np.uint8)
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
@@ -54,3 +54,21 @@ def test_fused_adam_steps_as_plain_adam():
 def test_another_optimizer_gets_its_own_arguments_alone(kwargs):
     policy = ImagePolicy(IMAGES, ACTIONS, lambda _: 1e-2, optimizer_class=th.optim.SGD, **kwargs)
     assert policy.optimizer_kwargs == kwargs.get("optimizer_kwargs", {})
+
+
+def test_bfloat16_rounds_features_and_nothing_else():
+    th.manual_seed(0)
+    plain, rounded = ConvEncoder(IMAGES), ConvEncoder(IMAGES, dtype="bfloat16")
+    rounded.load_state_dict(plain.state_dict())
+    images = th.rand(4, 3, 40, 40)
+    features = rounded(images)
+    assert features.dtype == th.float32
+    assert not th.equal(features, plain(images))
+    th.testing.assert_close(features, plain(images), rtol=0, atol=0.05)
+    features.sum().backward()
+    assert {p.grad.dtype for p in rounded.parameters()} == {th.float32}
+
+
+def test_unknown_dtype_is_refused():
+    with pytest.raises(ValueError, match="dtype is 'float16': use one of float32, bfloat16"):
+        ConvEncoder(IMAGES, dtype="float16")
