@@ -51,7 +51,7 @@ def test_the_wheel_alone(tmp_path: Path) -> None:
         code = f"import importlib.util as u, sys; sys.exit(u.find_spec({absent!r}) is not None)"
         run(python, "-c", code)
     report = run(
-        *(python, "-m", "pytest", "-q", "-W", "error", "-m", "not packaging"),
+        *(python, "-m", "pytest", "-q", "-W", "error", "-m", "not packaging and not slow"),
         # The repository's own configuration asks for plugins that this environment lacks.
         *(
             "-c",
@@ -59,7 +59,7 @@ def test_the_wheel_alone(tmp_path: Path) -> None:
             "--rootdir",
             HERE,
             "-o",
-            "markers=packaging: a wheel\ntimeout: seconds",
+            "markers=packaging: a wheel\nslow: minutes of work\ntimeout: seconds",
         ),
         *("-p", "no:cacheprovider", HERE),
     )
