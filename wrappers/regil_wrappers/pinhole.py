@@ -55,7 +55,7 @@ class Pinhole:
     @property
     def matrix(self) -> Floats:
         """(3, 3), action axes to camera axes."""
-        return cast("Floats", cv2.Rodrigues(np.array(self.rotation))[0])
+        return cast("Floats", cv2.Rodrigues(np.array(self.rotation, float))[0])
 
     @property
     def _centre(self) -> Floats:
@@ -112,8 +112,10 @@ class Pinhole:
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise ValueError(f"{values!r} is not a calibrated camera ({error!r})") from error
         flat = [*camera.rotation, camera.focal, camera.depth, *camera.hand, camera.cost]
-        if not np.isfinite(flat).all() or min(camera.focal, camera.depth) <= 0:
+        if not np.isfinite(flat).all() or min(camera.focal, camera.depth, *camera.size) <= 0:
             raise ValueError(f"{values!r} is not a calibrated camera: its numbers must be finite")
+        if camera.mirror not in (1, -1):
+            raise ValueError(f"{values!r} is not a calibrated camera: mirror must be 1 or -1")
         return camera
 
 

@@ -31,6 +31,7 @@ _DIFFERENT = 25.0  # of 255: a pixel that differs by more in some channel has ch
 _TRUNCATION = 76.5  # of 255: an error counts no more than this, so that what is hidden costs little
 _SMALLEST = 12  # changed pixels at 84 pixels; fewer: nothing has moved
 _SPECK = 4  # connected changed pixels at 84 pixels; fewer are noise
+_UNEVEN = 12.0  # std of a channel; an evener one cannot tell a gain, only an offset
 _HULL_WEIGHT = 0.2  # of the unchanged pixels between changed ones
 _COARSE = 42  # side of the pictures of the coarse search
 _REACH = 14  # how far it looks, in pixels of these
@@ -74,8 +75,11 @@ def match_colours(reference: Picture, picture: Picture) -> Floats:
         gain, offset = 1.0, 0.0
         for threshold in (60.0, 25.0, 25.0):
             same = np.abs(gain * x + offset - y) < threshold
-            if same.mean() < 0.07 or x[same].std() < 3:
+            if same.mean() < 0.07:
                 break
+            if x[same].std() < _UNEVEN:
+                offset = float(np.median(y[same] - gain * x[same]))
+                continue
             gain, offset = np.polyfit(x[same], y[same], 1)
         matched[..., channel] = np.clip(gain * x + offset, 0, 255).reshape(picture.shape[:2])
     return matched
