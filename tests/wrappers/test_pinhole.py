@@ -164,7 +164,7 @@ def test_nearest_to_path() -> None:
             nearest_to_path(camera, camera.project(place), path), place, atol=1e-9
         )
     # a pixel beside the path: on its own ray all the same
-    pixel = camera.project(path[2]) + (2, 1)
+    pixel = camera.project(path[2]) + np.array([2, 1])
     found = nearest_to_path(camera, pixel, path)
     np.testing.assert_allclose(camera.project(found), pixel, atol=1e-9)
     assert np.linalg.norm(found - path, axis=1).min() < 4

@@ -85,11 +85,11 @@ def _pair(shift: Any) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("growth", [0.85, 1.15, 1.25])
 def test_growth(growth: float) -> None:
     shift = (5.0, 6.0)
-    found = register(scene(), scene(HOME + shift, growth))
+    found = register(scene(), scene(HOME + np.array(shift), growth))
     assert found is not None
     assert found.growth == pytest.approx(growth, abs=0.05)
     # what stood at the point, not the thing's middle, has moved so far
-    wanted = HOME + shift + growth * (found.point - HOME) - found.point
+    wanted = HOME + np.array(shift) + growth * (found.point - HOME) - found.point
     assert off_by(found, wanted) < 0.5
 
 
