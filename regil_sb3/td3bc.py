@@ -30,42 +30,16 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_w
 from stable_baselines3.td3.policies import MlpPolicy, MultiInputPolicy, TD3Policy
 from torch.nn import functional as F  # noqa: N812
 
+from regil_sb3.arguments import check_arguments
 from regil_sb3.as_seen import as_seen
 from regil_sb3.bc_schedule import BySuccess, by_time
+from regil_sb3.collection import Collection
 from regil_sb3.policies import ImagePolicy
 from regil_sb3.relabelling import EpisodeRewards, episode_reward_class, rewards_come_late
 from regil_sb3.replay_buffer import FrameReplayBuffer
-from regil_sb3.success_buffer import Observations, SuccessBuffer
+from regil_sb3.success_buffer import SuccessBuffer
 
 SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
-
-_CHOICES = {
-    "bc_loss": ("mse", "nll"),
-    "bc_schedule": ("time", "success"),
-    "actor_q": ("min", "q1"),
-}
-_NUMBER = (int, float)
-_RANGES: dict[str, tuple[tuple[type, ...], float, float]] = {
-    "buffer_size": ((int,), 1, np.inf),
-    "learning_starts": ((int,), 0, np.inf),
-    "batch_size": ((int,), 1, np.inf),
-    "tau": (_NUMBER, 0.0, 1.0),
-    "gamma": (_NUMBER, 0.0, 1.0),
-    "gradient_steps": (_NUMBER, -1, np.inf),
-    "n_steps": ((int,), 1, np.inf),
-    "policy_delay": ((int,), 1, np.inf),
-    "target_policy_noise": (_NUMBER, 0.0, np.inf),
-    "target_noise_clip": (_NUMBER, 0.0, np.inf),
-    "warmup_steps": ((int,), 0, np.inf),
-    "bc_coef": (_NUMBER, 0.0, np.inf),
-    "bc_floor": (_NUMBER, 0.0, 1.0),
-    "bc_std": (_NUMBER, 1e-6, np.inf),
-    "bc_pretrain_steps": ((int,), 0, np.inf),
-    "success_buffer_size": ((int,), 1, np.inf),
-    "q_coef": (_NUMBER, 0.0, np.inf),
-    "exploration_std": (_NUMBER, 0.0, np.inf),
-    "exploration_clip": (_NUMBER, 0.0, np.inf),
-}
 
 
 class TD3BC(TD3):
@@ -108,6 +82,8 @@ class TD3BC(TD3):
         target_policy_noise: std of the target's smoothing noise.
         target_noise_clip: its limit.
         warmup_steps: steps in which the guide acts. An episode begun in warm-up is finished in it.
+        guide_share: after the warm-up, the share of episodes that the guide takes over from the
+            policy at a random step; the guide's own actions are what is kept of them.
         bc_coef: lambda at the start; 0 for no BC term.
         bc_floor: lambda's floor as a share of ``bc_coef``.
         bc_steps: steps until lambda would reach 0; None is the whole of ``learn``.
@@ -175,6 +151,7 @@ class TD3BC(TD3):
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.3,
         warmup_steps: int = 5_000,
+        guide_share: float = 0.0,
         bc_coef: float = 2.0,
         bc_floor: float = 0.1,
         bc_steps: int | None = None,
@@ -200,22 +177,11 @@ class TD3BC(TD3):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        given = dict(locals())
-        for name, choices in _CHOICES.items():
-            if given[name] not in choices:
-                raise ValueError(f"{name} is {given[name]!r}: use one of {', '.join(choices)}")
-        for name, (kinds, least, most) in _RANGES.items():
-            _check_number(name, given[name], kinds, least, most)
-        if reward_scale != "auto":
-            _check_number("reward_scale", reward_scale, (int, float), 0.0, np.inf)
-        if bc_steps is not None:
-            _check_number("bc_steps", bc_steps, (int,), 1, np.inf)
+        check_arguments(locals())
         if isinstance(env, gym.Env | VecEnv) and not isinstance(env.action_space, spaces.Box):
             raise ValueError(f"the action space is {env.action_space}: TD3BC needs a Box")
-        if q_coef == 0 and bc_coef == 0:
-            raise ValueError("q_coef=0 and bc_coef=0 leave the actor nothing to learn from")
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
-        self.warmup_steps = warmup_steps
+        self.warmup_steps, self.guide_share = warmup_steps, guide_share
         self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps
         self.bc_schedule = bc_schedule
         self.keep_own_successes, self.actor_in_warmup = keep_own_successes, actor_in_warmup
@@ -307,9 +273,14 @@ class TD3BC(TD3):
             self._add_demonstration(self.demo)
         super()._setup_model()
         self.replay_buffer_class = chosen
-        self._guided = np.zeros(self.n_envs, bool)
-        self._returns: dict[str, list[float]] = {"env_reward": [], "retrieval_reward": []}
-        self._forget_open_episodes()
+        self._returns: dict[str, list[float]] = {}
+        assert self.action_space.shape is not None
+        self._collection = Collection(
+            self.n_envs,
+            self.action_space.shape,
+            self.guide_share,
+            len(self.demo) if self.demo is not None else 1,
+        )
 
     def _check_demo(self) -> None:
         if self.bc_coef == 0:
@@ -341,11 +312,12 @@ class TD3BC(TD3):
         if self.bc_coef > 0 and not self.success_buffer.steps:
             assert self.demo is not None
             self._add_demonstration(self.demo)
-        if self.warmup_steps > 0 and not self.env.has_attr("guide_action"):
-            raise ValueError(
-                f"warmup_steps={self.warmup_steps} needs a guide: wrap the environment in "
-                "regil_wrappers.RetrievalGuideWrapper, or set warmup_steps=0"
-            )
+        for name in ("warmup_steps", "guide_share"):
+            if getattr(self, name) > 0 and not self.env.has_attr("guide_action"):
+                raise ValueError(
+                    f"{name}={getattr(self, name)} needs a guide: wrap the environment in "
+                    f"regil_wrappers.RetrievalGuideWrapper, or set {name}=0"
+                )
         if self.reward_scale == "auto":
             self.used_reward_scale = 1.0
             if self.env.has_attr("reward_scale"):
@@ -368,25 +340,15 @@ class TD3BC(TD3):
         if reset_num_timesteps:
             self.pretrained = False
         if begins_anew:  # the environments were reset, whatever they were doing
-            self._guided = np.full(self.n_envs, self.num_timesteps < self.warmup_steps)
-            self._forget_open_episodes()
+            self._collection.restart(self.num_timesteps < self.warmup_steps)
             if isinstance(self.replay_buffer, FrameReplayBuffer):
                 self.replay_buffer.close_episodes()
         return result
 
-    def _forget_open_episodes(self) -> None:
-        assert self.action_space.shape is not None
-        self._succeeded = np.zeros(self.n_envs, bool)
-        self._demonstrates = np.zeros(self.n_envs, bool)  # an episode's first step tells
-        self._lengths = np.zeros(self.n_envs, int)
-        self._labels = np.zeros((self.n_envs, *self.action_space.shape), np.float32)
-        self._episodes: list[list[tuple[Any, npt.NDArray[Any]]]] = [[] for _ in range(self.n_envs)]
-        self._running = {k: np.zeros(self.n_envs) for k in ("env_reward", "retrieval_reward")}
-
     @property
-    def guided(self) -> bool:
-        """Whether the guide still acts in some environment."""
-        return bool(self._guided.any())
+    def in_warmup(self) -> bool:
+        """Whether an episode of the warm-up is still under way in some environment."""
+        return bool(self._collection.warmup.any())
 
     def _sample_action(
         self,
@@ -396,7 +358,8 @@ class TD3BC(TD3):
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
         assert isinstance(self.action_space, spaces.Box)
         assert self.env is not None
-        if self._guided.all():
+        guided, labelled = self._collection.guided, self._collection.labelled
+        if guided.all():
             action = np.zeros((n_envs, *self.action_space.shape), np.float32)
             buffer_action = action.copy()
         else:
@@ -408,12 +371,16 @@ class TD3BC(TD3):
                 # float32 may put an unscaled bound outside by its last bit
                 action = self.policy.unscale_action(buffer_action)
                 action = action.clip(self.action_space.low, self.action_space.high)
-        if self._guided.any():
-            indices = np.flatnonzero(self._guided)
+        if labelled.any():
+            indices = np.flatnonzero(labelled)
             suggested = self._guide_actions("guide_action", indices)
-            self._labels[indices] = self.policy.scale_action(suggested)
-            if self.env.has_attr("disturbed_action"):
-                suggested = self._guide_actions("disturbed_action", indices)
+            self._collection.note_guide(indices, self.policy.scale_action(suggested))
+        if guided.any():
+            indices = np.flatnonzero(guided)
+            disturbs = self.env.has_attr("disturbed_action")
+            suggested = self._guide_actions(
+                "disturbed_action" if disturbs else "guide_action", indices
+            )
             action[indices] = suggested
             buffer_action[indices] = self.policy.scale_action(suggested)
         self._in_step = True
@@ -431,9 +398,9 @@ class TD3BC(TD3):
     ) -> None:
         # SB3 reads is_success at the episode's end alone: a success on the way counts too
         for i, info in enumerate(infos):
-            self._succeeded[i] |= bool(info.get("is_success", False))
+            self._collection.succeeded[i] |= bool(info.get("is_success", False))
             if dones is not None and dones[i] and "is_success" in info:
-                info["is_success"] = bool(self._succeeded[i])
+                info["is_success"] = bool(self._collection.succeeded[i])
         super()._update_info_buffer(infos, dones)
 
     def _store_transition(
@@ -449,55 +416,29 @@ class TD3BC(TD3):
         before = self._last_obs
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         for i, info in enumerate(infos):
-            retrieval = info.get("retrieval", {})
-            self._demonstrates[i] = not retrieval.get("calibrating", False)
-            if self._guided[i] or self.keep_own_successes:
-                seen = (
-                    {k: v[i].copy() for k, v in before.items()}
-                    if isinstance(before, dict)
-                    else np.array(before[i])  # type: ignore[index]
-                )
-                done_here = self._labels[i] if self._guided[i] else buffer_action[i]
-                self._episodes[i].append((seen, done_here.copy()))
-            self._running["env_reward"][i] += retrieval.get("env_reward", reward[i])
-            late = np.sum(retrieval.get("episode_rewards", 0.0))
-            self._running["retrieval_reward"][i] += reward[i] + late
-            self._lengths[i] += 1
+            self._collection.step(i, before, buffer_action[i], float(reward[i]), info)
             if dones[i]:
                 self._end_episode(i)
         self._in_step = False
 
     def _end_episode(self, env: int) -> None:
-        own = not self._guided[env]
+        episodes = self._collection
+        own = not episodes.labelled[env]
         if own:
-            part = self._lengths[env] / max(self._total_timesteps - self.warmup_steps, 1)
-            self._by_success.episode(bool(self._succeeded[env]), part)
-        if (self.keep_own_successes or not own) and self._kept(env):
-            seen, actions = zip(*self._episodes[env], strict=True)
-            observations: Observations = (
-                {k: np.stack([o[k] for o in seen]) for k in seen[0]}
-                if isinstance(seen[0], dict)
-                else np.stack(seen)
+            part = episodes.lengths[env] / max(self._total_timesteps - self.warmup_steps, 1)
+            self._by_success.episode(bool(episodes.succeeded[env]), part)
+        shown = episodes.demonstration(env) if self.keep_own_successes or not own else None
+        if shown is not None and not self.success_buffer.add(*shown):
+            warnings.warn(
+                f"a successful episode of {len(shown[1])} steps does not fit beside the "
+                f"demonstration into success_buffer_size={self.success_buffer_size}: it is not "
+                "kept",
+                stacklevel=2,
             )
-            if not self.success_buffer.add(observations, np.stack(actions)):
-                warnings.warn(
-                    f"a successful episode of {len(actions)} steps does not fit beside the "
-                    f"demonstration into success_buffer_size={self.success_buffer_size}: it is "
-                    "not kept",
-                    stacklevel=2,
-                )
-        for name, running in self._running.items():
-            self._returns[name].append(float(running[env]))
+        for name, value in episodes.returns(env).items():
+            self._returns.setdefault(name, []).append(value)
             del self._returns[name][: -self._stats_window_size]
-            running[env] = 0.0
-        self._episodes[env] = []
-        self._lengths[env] = 0
-        self._demonstrates[env] = False
-        self._succeeded[env] = False
-        self._guided[env] = self.num_timesteps < self.warmup_steps
-
-    def _kept(self, env: int) -> bool:
-        return bool(self._succeeded[env] and self._demonstrates[env] and self._episodes[env])
+        episodes.end(env, self.num_timesteps < self.warmup_steps)
 
     def _check_finite(self, reward: npt.NDArray[Any], new_obs: Any) -> None:
         values = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}
@@ -516,7 +457,7 @@ class TD3BC(TD3):
                 self.logger.record(f"rollout/{name}", safe_mean(values))
         self.logger.record("success_buffer/steps", self.success_buffer.steps)
         self.logger.record("success_buffer/episodes", self.success_buffer.episodes)
-        self.logger.record("time/guided", int(self.guided))
+        self.logger.record("time/guided", int(self.in_warmup))
         self.logger.record("train/reward_scale", self.used_reward_scale)
         super().dump_logs()
 
@@ -592,7 +533,7 @@ class TD3BC(TD3):
 
     def train(self, gradient_steps: int | float, batch_size: int = 64) -> None:
         """Update critic and actor; a diff of ``TD3.train`` with Eq. 4 as the actor's loss."""
-        if not self.pretrained and not self.guided and self.num_timesteps >= self.warmup_steps:
+        if not self.pretrained and not self.in_warmup and self.num_timesteps >= self.warmup_steps:
             if self.bc_coef > 0:
                 self.pretrain_bc(self.bc_pretrain_steps)
             self.pretrained = True
@@ -603,7 +544,7 @@ class TD3BC(TD3):
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
         shared = self.critic.features_extractor is self.actor.features_extractor
-        trains_actor = self.actor_in_warmup or not self.guided
+        trains_actor = self.actor_in_warmup or not self.in_warmup
 
         actor_losses, critic_losses, bc_losses = [], [], []
         for _ in range(self._number_of_updates(gradient_steps)):
@@ -722,26 +663,9 @@ class TD3BC(TD3):
             "demo",
             "success_buffer",
             "_in_step",
-            "_episodes",
-            "_guided",
-            "_succeeded",
-            "_demonstrates",
-            "_lengths",
-            "_labels",
-            "_running",
+            "_collection",
             "_returns",
         ]
-
-
-def _check_number(
-    name: str, value: Any, kinds: tuple[type, ...], least: float, most: float
-) -> None:
-    """Refuse what is no number of these kinds within [least, most], in one line."""
-    fits = isinstance(value, (*kinds, np.integer)) and not isinstance(value, bool)
-    if not fits or not least <= value <= most:
-        kind = "a whole number" if kinds == (int,) else "a number"
-        upper = f" and at most {most:g}" if most < np.inf else ""
-        raise ValueError(f"{name} is {value!r}: it must be {kind} of at least {least:g}{upper}")
 
 
 def encode(network: Any, observations: Any) -> th.Tensor:

@@ -151,7 +151,7 @@ class TrainingCallback(BaseCallback):
         self.logger.record("time/frames", self.num_timesteps * self._repeat)
         if self.num_timesteps >= self._next:
             save_calibration(self.training_env, self.run / "calibration.json")
-            if not model.guided:
+            if not model.in_warmup:
                 self._evaluate()
             else:
                 save_model(model, self.run / "model.zip")
@@ -162,7 +162,7 @@ class TrainingCallback(BaseCallback):
         model = self._td3bc
         recent = model.ep_success_buffer
         success = f"{np.mean(recent):.2f}" if recent else "-"
-        phase = "guide acts" if model.guided else "policy acts"
+        phase = "guide acts" if model.in_warmup else "policy acts"
         best = f", best {self.best:.2f}" if self.best >= 0 else ""
         self._bar.set_description_str(phase, refresh=False)
         self._bar.set_postfix_str(

@@ -32,6 +32,7 @@ Mirror = Literal["auto", 1, -1]
 
 _RAMP = 0.15  # of the demonstration: the share in which the correction grows to its full size
 _REACHED = 0.3  # of a full action: a place of the path counts as reached
+_AHEAD = 10  # places ahead of the next that may be reached before it
 _SETTLE = 0.1  # s that a calibration move is given to come to rest
 _RELEASE = (10, 12)  # steps after the gripper closes: the correction starts to fade; fades over
 _WORST_RATIO = 0.95  # a registration that explains less is not believed
@@ -239,12 +240,25 @@ class Servo:
             self._calibration_step(self._segment, picture)
             return
         if self._way.kind != "plain":
-            target = self._target()
             delta = np.asarray(action, float)[self._dims]
             self._hand = self._hand + np.clip(delta, -self._limit, self._limit)
-            if (np.abs(target - self._hand) <= _REACHED * self._limit).all():
-                self._at += 1
+            self._at = self._next_place()
             self._next_kick()
+
+    def _next_place(self) -> int:
+        """The place after the one reached: who acts in the guide's stead may cut a corner.
+
+        Nothing is skipped that the gripper does on the way.
+        """
+        for i in range(self._at, min(self._at + _AHEAD, len(self._path))):
+            if self._gripper is not None and np.ptp(self._actions[self._at : i + 1, self._gripper]):
+                break
+            if self._near(i):
+                return i + 1
+        return self._at + (self._at >= len(self._path) and self._near(self._at))
+
+    def _near(self, i: int) -> bool:
+        return bool((np.abs(self._place(i) - self._hand) <= _REACHED * self._limit).all())
 
     def finish(self, success: bool) -> None:
         """The episode is over; what came of it counts where the guide chose every action."""

@@ -1,0 +1,69 @@
+"""What TD3BC's arguments may be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+_CHOICES = {
+    "bc_loss": ("mse", "nll"),
+    "bc_schedule": ("time", "success"),
+    "actor_q": ("min", "q1"),
+}
+_NUMBER = (int, float)
+_RANGES: dict[str, tuple[tuple[type, ...], float, float]] = {
+    "buffer_size": ((int,), 1, np.inf),
+    "learning_starts": ((int,), 0, np.inf),
+    "batch_size": ((int,), 1, np.inf),
+    "tau": (_NUMBER, 0.0, 1.0),
+    "gamma": (_NUMBER, 0.0, 1.0),
+    "gradient_steps": (_NUMBER, -1, np.inf),
+    "n_steps": ((int,), 1, np.inf),
+    "policy_delay": ((int,), 1, np.inf),
+    "target_policy_noise": (_NUMBER, 0.0, np.inf),
+    "target_noise_clip": (_NUMBER, 0.0, np.inf),
+    "warmup_steps": ((int,), 0, np.inf),
+    "guide_share": (_NUMBER, 0.0, 1.0),
+    "bc_coef": (_NUMBER, 0.0, np.inf),
+    "bc_floor": (_NUMBER, 0.0, 1.0),
+    "bc_std": (_NUMBER, 1e-6, np.inf),
+    "bc_pretrain_steps": ((int,), 0, np.inf),
+    "success_buffer_size": ((int,), 1, np.inf),
+    "q_coef": (_NUMBER, 0.0, np.inf),
+    "exploration_std": (_NUMBER, 0.0, np.inf),
+    "exploration_clip": (_NUMBER, 0.0, np.inf),
+}
+
+
+def check_arguments(given: dict[str, Any]) -> None:
+    """Refuse what TD3BC cannot work with, in one line, before anything is allocated.
+
+    Args:
+        given: its constructor's arguments by name.
+
+    Raises:
+        ValueError: a value is of the wrong kind, or out of range.
+    """
+    for name, choices in _CHOICES.items():
+        if given[name] not in choices:
+            raise ValueError(f"{name} is {given[name]!r}: use one of {', '.join(choices)}")
+    for name, (kinds, least, most) in _RANGES.items():
+        _check_number(name, given[name], kinds, least, most)
+    if given["reward_scale"] != "auto":
+        _check_number("reward_scale", given["reward_scale"], _NUMBER, 0.0, np.inf)
+    if given["bc_steps"] is not None:
+        _check_number("bc_steps", given["bc_steps"], (int,), 1, np.inf)
+    if given["q_coef"] == 0 and given["bc_coef"] == 0:
+        raise ValueError("q_coef=0 and bc_coef=0 leave the actor nothing to learn from")
+
+
+def _check_number(
+    name: str, value: Any, kinds: tuple[type, ...], least: float, most: float
+) -> None:
+    """Refuse what is no number of these kinds within [least, most], in one line."""
+    fits = isinstance(value, (*kinds, np.integer)) and not isinstance(value, bool)
+    if not fits or not least <= value <= most:
+        kind = "a whole number" if kinds == (int,) else "a number"
+        upper = f" and at most {most:g}" if most < np.inf else ""
+        raise ValueError(f"{name} is {value!r}: it must be {kind} of at least {least:g}{upper}")

@@ -1,0 +1,121 @@
+"""Who acts in each environment, and what is kept of the episodes under way."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from regil_sb3.success_buffer import Observations
+
+_REWARDS = ("env_reward", "retrieval_reward")
+
+
+class Collection:
+    """The open episodes of some environments.
+
+    An episode of the warm-up is the guide's. Of the others the policy begins each, and the guide
+    finishes a share: it takes over at a step drawn at random, and what it would have done before is
+    noted too. An episode that succeeds so shows the way back from where the policy gets to.
+
+    Args:
+        n_envs: environments.
+        action_shape: (A,) of one action.
+        guide_share: probability that the guide finishes an episode that the policy began.
+        latest: the guide takes over before this step: the demonstration's length.
+    """
+
+    def __init__(
+        self, n_envs: int, action_shape: tuple[int, ...], guide_share: float, latest: int
+    ) -> None:
+        self._guide_share, self._latest = guide_share, latest
+        self._labels = np.zeros((n_envs, *action_shape), np.float32)
+        self.restart(False)
+
+    def restart(self, warmup: bool) -> None:
+        """Every environment was reset, whatever it was doing."""
+        n_envs = len(self._labels)
+        self.warmup = np.full(n_envs, warmup)
+        self.lengths = np.zeros(n_envs, int)
+        self.succeeded = np.zeros(n_envs, bool)
+        self._takeover = np.zeros(n_envs)
+        self._demonstrates = np.zeros(n_envs, bool)  # an episode's first step tells
+        self._steps: list[list[tuple[Any, npt.NDArray[Any]]]] = [[] for _ in range(n_envs)]
+        self._returns = {name: np.zeros(n_envs) for name in _REWARDS}
+        for env in range(n_envs):
+            self._begin(env, warmup)
+
+    def _begin(self, env: int, warmup: bool) -> None:
+        self.warmup[env] = warmup
+        shared = not warmup and self._guide_share > 0 and np.random.rand() < self._guide_share
+        own = np.random.randint(self._latest) if shared else np.inf
+        self._takeover[env] = 0 if warmup else own
+        self.lengths[env] = 0
+        self.succeeded[env] = self._demonstrates[env] = False
+        self._steps[env] = []
+        for returns in self._returns.values():
+            returns[env] = 0.0
+
+    @property
+    def guided(self) -> npt.NDArray[np.bool_]:
+        """(n_envs,) where the guide acts now."""
+        return self.lengths >= self._takeover
+
+    @property
+    def labelled(self) -> npt.NDArray[np.bool_]:
+        """(n_envs,) where the guide's action is noted, whoever acts."""
+        return np.isfinite(self._takeover)
+
+    def note_guide(self, indices: npt.NDArray[Any], actions: npt.NDArray[Any]) -> None:
+        """What the guides of these environments would do now, (n, A), scaled to [-1, 1]."""
+        self._labels[indices] = actions
+
+    def step(
+        self, env: int, seen: Any, action: npt.NDArray[Any], reward: float, info: dict[str, Any]
+    ) -> None:
+        """One step of an environment is done.
+
+        Args:
+            env: its index.
+            seen: what the policy saw before, of all environments: an array or a dict of such.
+            action: (A,) that was executed, scaled.
+            reward: of the step.
+            info: of the step.
+        """
+        retrieval = info.get("retrieval", {})
+        self._demonstrates[env] = not retrieval.get("calibrating", False)
+        before = (
+            {k: v[env].copy() for k, v in seen.items()}
+            if isinstance(seen, dict)
+            else np.array(seen[env])
+        )
+        noted = self._labels[env] if self.labelled[env] else action
+        self._steps[env].append((before, noted.copy()))
+        late = np.sum(retrieval.get("episode_rewards", 0.0))
+        self._returns["env_reward"][env] += retrieval.get("env_reward", reward)
+        self._returns["retrieval_reward"][env] += reward + late
+        self.lengths[env] += 1
+
+    def returns(self, env: int) -> dict[str, float]:
+        """Undiscounted returns of the environment's episode by name."""
+        return {name: float(values[env]) for name, values in self._returns.items()}
+
+    def demonstration(self, env: int) -> tuple[Observations, npt.NDArray[np.float32]] | None:
+        """What the environment's episode demonstrates: observations (T, ...), actions (T, A).
+
+        None where it did not succeed, or was calibrating.
+        """
+        if not (self.succeeded[env] and self._demonstrates[env] and self._steps[env]):
+            return None
+        seen, actions = zip(*self._steps[env], strict=True)
+        observations: Observations = (
+            {k: np.stack([o[k] for o in seen]) for k in seen[0]}
+            if isinstance(seen[0], dict)
+            else np.stack(seen)
+        )
+        return observations, np.stack(actions)
+
+    def end(self, env: int, warmup: bool) -> None:
+        """The environment's episode is over, and the next begins, in the warm-up or not."""
+        self._begin(env, warmup)
