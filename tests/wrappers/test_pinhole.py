@@ -91,7 +91,7 @@ def test_fit_to_exact_shifts(mirror: int, size: tuple[int, int]) -> None:
     place = nearest_to_path(found, camera.project(far), far[None])
     np.testing.assert_allclose(place, far, atol=1.5)
     np.testing.assert_allclose(
-        solve_displacement(found, place, shift, None, PLANE), moved, atol=0.8
+        solve_displacement(found, place, shift, None, PLANE)[0], moved, atol=0.8
     )
 
 
@@ -104,7 +104,8 @@ def test_fit_to_noisy_shifts() -> None:
     for seed in range(5):
         found = fitted(camera, noise=0.3, seed=seed)
         assert found.cost > fitted(camera).cost
-        off.append(np.linalg.norm(solve_displacement(found, place, shift, None, PLANE) - moved))
+        solved, _ = solve_displacement(found, place, shift, None, PLANE)
+        off.append(np.linalg.norm(solved - moved))
     assert np.median(off) < 1.5
     assert max(off) < 3
 
@@ -134,8 +135,9 @@ def test_a_displacement_is_solved_back(mirror: int) -> None:
         shift = camera.project(place + moved) - camera.project(place)
         growth = float(camera.depths(place) / camera.depths(place + moved))
         for g in (growth, None):
-            found = solve_displacement(camera, place, shift, g, PLANE)
+            found, misfit = solve_displacement(camera, place, shift, g, PLANE)
             np.testing.assert_allclose(found, moved, atol=0.25)
+            assert misfit < 2.5  # the plane's share: displacements up to 1.2 std along two axes
 
 
 def test_growth_tells_depth_where_the_plane_is_open() -> None:
@@ -144,15 +146,23 @@ def test_growth_tells_depth_where_the_plane_is_open() -> None:
     shift = camera.project(place + moved) - camera.project(place)
     growth = float(camera.depths(place) / camera.depths(place + moved))
     with_growth, without = (
-        solve_displacement(camera, place, shift, g, PLANE) for g in (growth, None)
+        solve_displacement(camera, place, shift, g, PLANE)[0] for g in (growth, None)
     )
     assert abs(with_growth[1] + 12) < 2.5 < 5 < abs(without[1] + 12)
+
+
+def test_what_no_displacement_in_the_plane_explains_is_a_misfit() -> None:
+    camera, place = looking_down(), np.array([2.0, 6.0, -10.0])
+    shift = camera.project(place + np.array([9.0, 0.0, 0.0])) - camera.project(place)
+    _, right = solve_displacement(camera, place, shift, 1.0, np.array([10.0, 10.0, 0.5]))
+    _, wrong = solve_displacement(camera, place, shift, 1.0, np.array([0.5, 10.0, 10.0]))
+    assert wrong > 8 > 1.5 > right
 
 
 def test_no_shift_is_no_displacement() -> None:
     camera = looking_down()
     np.testing.assert_allclose(
-        solve_displacement(camera, np.array([3.0, 5.0, -8.0]), (0, 0), 1.0, PLANE), 0, atol=1e-6
+        solve_displacement(camera, np.array([3.0, 5.0, -8.0]), (0, 0), 1.0, PLANE)[0], 0, atol=1e-6
     )
 
 

@@ -13,16 +13,15 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import Any, Literal, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from regil_wrappers.pinhole import Pinhole, fit_pinhole, nearest_to_path, solve_displacement
-from regil_wrappers.registration import Displacement, local_shift
+from regil_wrappers.calibration import Calibration
+from regil_wrappers.pinhole import Pinhole, nearest_to_path, solve_displacement
+from regil_wrappers.registration import Displacement
 
 __all__ = ["Servo"]
 
@@ -36,10 +35,11 @@ _AHEAD = 10  # places ahead of the next that may be reached before it
 _SETTLE = 0.1  # s that a calibration move is given to come to rest
 _RELEASE = (10, 12)  # steps after the gripper closes: the correction starts to fade; fades over
 _WORST_RATIO = 0.95  # a registration that explains less is not believed
-_FARTHEST = 3.5  # displacements beyond this many times the plane's largest std are not believed
 _KICK_EVERY = 10  # steps of a disturbed episode, on average
 _DISTURBED = 0.5  # of a full action: a replay that was disturbed by no more is a replay
-_STILL = 0.5  # px at 84 pixels: a pair of calibration pictures that shifted less says nothing
+_MISFIT = 4.0  # std: a displacement that fits picture and plane worse is not believed
+_OFTEN = 3  # episodes in which that happens before it is said
+_ENOUGH = 6  # corrected episodes before plain replay is said to be better
 
 # Successes and failures that each way of replaying starts with, Beta(a, b): what is usually best is
 # tried first, and given up when it fails.
@@ -55,15 +55,20 @@ class _Way:
     won: float
     lost: float
 
+    @property
+    def mean(self) -> float:
+        """Of the successes to be expected."""
+        return self.won / (self.won + self.lost)
 
-@dataclass
-class _Segment:
-    """Calibration moves that belong together: done within one episode, or again."""
+    @property
+    def successes(self) -> float:
+        """Seen, without those that it starts with."""
+        return self.won - _PRIORS[self.kind][0]
 
-    actions: list[NDArray[np.float32]]
-    marks: list[int]  # after how many actions a picture is kept; 0 is before the first
-    places: Floats  # (marks, 3): where the hand is then
-    pictures: list[Picture] = field(default_factory=list)
+    @property
+    def trials(self) -> float:
+        """Episodes seen."""
+        return self.won + self.lost - sum(_PRIORS[self.kind])
 
 
 class Servo:
@@ -110,7 +115,7 @@ class Servo:
     ) -> None:
         self._dims = _checked_dims(list(translation_dims), low, high)
         self._plane = np.array(list(plane), float)
-        if self._plane.shape != (3,) or not (self._plane > 0).all():
+        if self._plane.shape != (3,) or not ((self._plane > 0) & (self._plane < np.inf)).all():
             raise ValueError(
                 f"plane={list(plane)}: give three positive standard deviations, in action units"
             )
@@ -135,15 +140,22 @@ class Servo:
         self._last_delta = deltas[-1]
         self._mirrors = (1, -1) if mirror == "auto" else (mirror,)
         self._rng = np.random.default_rng(seed)
-        self._length = float(self._plane.max())
-        self._settle = max(2, math.ceil(_SETTLE * (control_rate or 40.0)))
         self._low, self._high = low, high
-
-        self._segments = self._plan()
-        self._done: list[_Segment] = []
+        self._calibration: Calibration | None = Calibration(
+            size,
+            self._idle(),
+            low,
+            high,
+            self._dims,
+            gripper_dim,
+            float(self._plane.max()),
+            self._mirrors,
+            max(2, math.ceil(_SETTLE * (control_rate or 40.0))),
+        )
         self.cameras: dict[int, Pinhole] = {}
         self._ways = self._all_ways()
         self.why = ""  # why replay is plain, where it is
+        self._off_plane = 0
         self._begin_episode()
 
     # -- what the guide calls --------------------------------------------------------------------
@@ -151,14 +163,12 @@ class Servo:
     @property
     def calibrated(self) -> bool:
         """Whether calibration is over, so that `reset` can use a displacement."""
-        return not self._segments
+        return self._calibration is None
 
     # Of an episode
     target_shift: Floats  # action units: where the target is believed to have gone
     _way: _Way
-    _segment: _Segment | None  # calibration moves under way
-    _step: int  # of them
-    _wait: int  # steps to rest before them
+    _moving: bool  # calibration moves are under way
     _calibrated_here: bool
     _followed: bool  # whether every action was the guide's
     _at: int  # the place of the path that the hand is on its way to
@@ -173,10 +183,9 @@ class Servo:
                 picture and this episode's; not used before `calibrated`.
         """
         self._begin_episode()
-        if self._segments:
-            self._segment = self._segments[0]
-            self._segment.pictures = []
-            self._wait = self._settle + 2  # the gripper may have to open or close first
+        if self._calibration is not None:
+            self._moving = True
+            self._calibration.begin()
         else:
             self._begin_replay(displacement)
 
@@ -208,14 +217,12 @@ class Servo:
     @property
     def kind(self) -> str:
         """What `action` is now: "calibration", "corrected", "released" or "plain"."""
-        return "calibration" if self._segment is not None else self._way.kind
+        return "calibration" if self._moving else self._way.kind
 
     def action(self) -> NDArray[np.float32] | None:
         """What to do now: (A,) float32; None for the demonstration's own, unchanged."""
-        if self._segment is not None:
-            if self._wait:
-                return self._idle()
-            return self._segment.actions[self._step]
+        if self._moving and self._calibration is not None:
+            return self._calibration.action
         if self._way.kind == "plain":
             return None
         action: NDArray[np.float32] = self._actions[min(self._at, len(self._actions) - 1)].copy()
@@ -232,12 +239,14 @@ class Servo:
         """
         off = float((np.abs(action - suggested) / np.maximum(self._high, 1e-9)).max())
         self._followed = self._followed and off <= _DISTURBED
-        if self._segment is not None:
+        if self._moving and self._calibration is not None:
             self._calibrated_here = True
             if off > 1e-3:  # somebody else acts: no calibration in this episode
-                self._segment, self._way = None, self._plain()
+                self._moving = False
                 return
-            self._calibration_step(self._segment, picture)
+            self._calibration.step(picture)
+            if self._calibration.over:
+                self._take_over(self._calibration)
             return
         if self._way.kind != "plain":
             delta = np.asarray(action, float)[self._dims]
@@ -262,16 +271,21 @@ class Servo:
 
     def finish(self, success: bool) -> None:
         """The episode is over; what came of it counts where the guide chose every action."""
-        if self._segment is None and self._followed and not self._calibrated_here:
+        if self._moving and self._followed and self._calibration is not None:
+            self._calibration.end()
+            if self._calibration.over:
+                self._take_over(self._calibration)
+        elif self._followed and not self._calibrated_here:
             if success:
                 self._way.won += 1
             else:
                 self._way.lost += 1
+            self._compare()
         self._followed = False  # once
 
     def state(self) -> dict[str, Any] | None:
         """What calibration found and which ways succeeded, as JSON values; None before that."""
-        if self._segments:
+        if not self.calibrated:
             return None
         return {
             "cameras": [camera.as_dict() for camera in self.cameras.values()],
@@ -296,12 +310,15 @@ class Servo:
             raise ValueError(f"the calibration is not from pictures of {height}x{width}")
         mirrors = {camera.mirror for camera in cameras}
         if "plain" not in {way.kind for way in ways} or not all(
-            way.kind == "plain" or way.mirror in mirrors for way in ways
+            way.kind in _PRIORS
+            and (way.kind == "plain" or way.mirror in mirrors)
+            and min(way.won, way.lost) > 0
+            for way in ways
         ):
             raise ValueError("not the state of a calibrated guide: ways and cameras do not fit")
         self.cameras = {camera.mirror: camera for camera in cameras}
         self._ways, self.why = ways, why
-        self._segments = []
+        self._calibration = None
         self._begin_episode()
 
     # -- replaying -------------------------------------------------------------------------------
@@ -310,13 +327,54 @@ class Servo:
         self._way = self._chosen()
         # Every other episode goes undisturbed, and tells which way of replaying is best
         self._disturbs = not self._disturbs and self._disturbance > 0
-        if self._way.kind == "plain" or found is None or found.ratio > _WORST_RATIO:
+        if self._way.kind == "plain" or found is None:
             return
+        shift, misfit = self._solved(found)
+        if found.ratio > _WORST_RATIO:
+            self._way = self._plain()
+        elif misfit > _MISFIT:
+            self._way = self._plain()
+            self._off_plane += 1
+            if self._off_plane == _OFTEN:
+                self._say(
+                    f"plane={self._plane.tolist()}: in {_OFTEN} episodes no displacement in this "
+                    f"plane explained what was seen to move (off by {misfit:.1f} standard "
+                    "deviations); there the guide replays without correction"
+                )
+        else:
+            self.target_shift = shift
+
+    def _solved(self, found: Displacement) -> tuple[Floats, float]:
+        """The displacement in action units, and by how many standard deviations it is off."""
         camera = self.cameras[self._way.mirror]
         place = nearest_to_path(camera, found.point, self._path)
-        shift = solve_displacement(camera, place, found.shift, found.growth, self._plane)
-        if np.linalg.norm(shift) <= _FARTHEST * self._length:
-            self.target_shift = shift
+        return solve_displacement(camera, place, found.shift, found.growth, self._plane)
+
+    def _say(self, why: str) -> None:
+        self.why = why
+        warnings.warn(why, stacklevel=2)
+
+    def _take_over(self, calibration: Calibration) -> None:
+        self.cameras = calibration.cameras
+        self._ways = self._all_ways()
+        self._calibration, self._moving = None, False
+        self._way = self._plain()  # what is left of this episode
+        if calibration.why:
+            self._say(f"{calibration.why}; the guide replays without correction")
+
+    def _compare(self) -> None:
+        """Say so, once, when plain replay has turned out to be better."""
+        corrected = [way for way in self._ways if way.kind != "plain"]
+        plain = self._plain()
+        tried = sum(way.trials for way in corrected)
+        if self.why or tried < _ENOUGH or any(way.mean > plain.mean for way in corrected):
+            return
+        won = sum(way.successes for way in corrected)
+        self._say(
+            f"corrected replay succeeded in {won:.0f} of {tried:.0f} episodes, plain replay in "
+            f"{plain.successes:.0f} of {plain.trials:.0f}: the guide mostly replays without "
+            "correction from here; are plane, mirror and translation_dims those of this task?"
+        )
 
     def _chosen(self) -> _Way:
         """Thompson sampling on the successes seen."""
@@ -343,15 +401,21 @@ class Servo:
         return int(events[0]) + 1 if len(events) else None
 
     def _begin_episode(self) -> None:
-        self._segment = None
-        self._step = self._wait = 0
-        self._calibrated_here = False
+        self._moving = self._calibrated_here = False
         self._followed = True
         self._at = 0
         self._hand = np.zeros(3)
         self._kick = np.zeros(3)
         self._way = self._plain()
         self.target_shift = np.zeros(3)
+
+    def _idle(self) -> NDArray[np.float32]:
+        """The action that holds still, the gripper as the demonstration begins, or open."""
+        action = np.zeros(self._actions.shape[1], np.float32)
+        if self._gripper is not None:
+            first = self._actions[0, self._gripper]
+            action[self._gripper] = first if abs(first) > 0.5 else self._low[self._gripper]
+        return action
 
     def corrected_path(self) -> Floats:
         """(T, 3) action units: the places that this episode's replay goes through."""
@@ -370,102 +434,6 @@ class Servo:
         place = self._path[min(i, n - 1)] + beyond * self._last_delta
         return cast("Floats", place + weight * self.target_shift)
 
-    # -- calibration -----------------------------------------------------------------------------
-
-    def _held(self) -> float:
-        """How the gripper is held: as the demonstration begins, or open."""
-        assert self._gripper is not None
-        first = float(self._actions[0, self._gripper])
-        return first if abs(first) > 0.5 else float(self._low[self._gripper])
-
-    def _idle(self, gripper: float | None = None) -> NDArray[np.float32]:
-        action = np.zeros(self._actions.shape[1], np.float32)
-        if self._gripper is not None:
-            action[self._gripper] = self._held() if gripper is None else gripper
-        return action
-
-    def _plan(self) -> list[_Segment]:
-        segments = []
-        if self._gripper is not None:
-            other = self._low + self._high
-            turned = self._idle(float(other[self._gripper]) - self._held())
-            actions = [turned] * self._settle + [self._idle()] * self._settle
-            marks = [0, self._settle, 2 * self._settle]
-            segments.append(_Segment(actions, marks, np.zeros((3, 3))))
-        for axis, dim in enumerate(self._dims):
-            actions, marks, places = [], [0], [np.zeros(3)]
-            for goal in (1.0, 0.0, -1.0, 0.0):
-                place = np.zeros(3)
-                place[axis] = goal * self._length / 2
-                way = place[axis] - places[-1][axis]
-                while abs(way) > 1e-9:
-                    part = float(np.clip(way, -self._limit[axis], self._limit[axis]))
-                    action = self._idle()
-                    action[dim] = part
-                    actions.append(action)
-                    way -= part
-                actions += [self._idle()] * self._settle
-                marks.append(len(actions))
-                places.append(place)
-            segments.append(_Segment(actions, marks, np.stack(places)))
-        return segments
-
-    def _calibration_step(self, segment: _Segment, picture: Picture) -> None:
-        if self._wait:
-            self._wait -= 1
-        else:
-            self._step += 1
-        if self._wait == 0 and self._step in segment.marks:
-            segment.pictures.append(picture.copy())
-        if self._step < len(segment.actions):
-            return
-        self._done.append(segment)
-        self._segments.pop(0)
-        self._step = 0
-        self._segment = self._segments[0] if self._segments else None
-        if self._segment is not None:
-            self._segment.pictures = [picture.copy()]
-            return
-        self._calibrate()
-        self._done = []
-        self._way = self._plain()  # what is left of this episode
-
-    def _calibrate(self) -> None:
-        moves = [segment for segment in self._done if segment.places.any()]
-        hand = _moves_most([segment.pictures for segment in moves])
-        gripper = [segment for segment in self._done if not segment.places.any()]
-        if gripper:
-            tool = _tool_pixel(gripper[0].pictures, hand, self._unit)
-            hand = hand if tool is None else tool
-        before, after, shifts = [], [], []
-        for segment, dim in zip(moves, self._dims, strict=True):
-            shifted = np.stack([local_shift(a, b, hand) for a, b in pairwise(segment.pictures)])
-            seen = np.linalg.norm(shifted, axis=1) > _STILL * self._unit
-            if not seen.any():
-                self.why = (
-                    f"translation_dims: action dimension {dim} does not move the hand's picture: "
-                    "it must be a delta that moves it"
-                )
-            before.append(segment.places[:-1][seen])
-            after.append(segment.places[1:][seen])
-            shifts.append(shifted[seen])
-        if self.why:
-            warnings.warn(f"{self.why}; the guide replays without correction", stacklevel=2)
-            return
-        for mirror in self._mirrors:
-            self.cameras[mirror] = fit_pinhole(
-                np.concatenate(before),
-                np.concatenate(after),
-                np.concatenate(shifts),
-                hand,
-                self._size,
-                mirror,
-                self._length,
-            )
-        # The better fit is tried first
-        self.cameras = dict(sorted(self.cameras.items(), key=lambda item: item[1].cost))
-        self._ways = self._all_ways()
-
 
 def _checked_dims(
     dims: list[int], low: NDArray[np.float32], high: NDArray[np.float32]
@@ -482,31 +450,3 @@ def _checked_dims(
                 "cannot be a delta: correction='servo' needs deltas"
             )
     return dims
-
-
-def _moves_most(pictures: list[list[Picture]]) -> Floats:
-    """Centroid (x, y) of the pixels that change most within sequences of pictures."""
-    change = sum(
-        cv2.GaussianBlur(np.abs(b.astype(np.float32) - a).max(axis=2), (0, 0), 2.0)
-        for sequence in pictures
-        for a, b in pairwise(sequence)
-    )
-    assert isinstance(change, np.ndarray)
-    _, labels = cv2.connectedComponents((change > 0.6 * change.max()).astype(np.uint8))
-    there = labels == labels[np.unravel_index(change.argmax(), change.shape)]
-    return _centroid(change * there)
-
-
-def _tool_pixel(pictures: list[Picture], near: Floats, unit: float) -> Floats | None:
-    """Centroid of what changes when only the gripper moves; None where too little does."""
-    still, turned, back = (p.astype(np.float32) for p in pictures)
-    change = np.abs(turned - still).max(axis=2) + np.abs(back - turned).max(axis=2)
-    y, x = np.mgrid[: change.shape[0], : change.shape[1]]
-    change = change * (np.hypot(x - near[0], y - near[1]) < 25 * unit)
-    much = (change > max(25.0, 0.3 * change.max())) & (change > 0)
-    return _centroid(change * much) if much.sum() >= 3 * unit**2 else None
-
-
-def _centroid(weights: NDArray[Any]) -> Floats:
-    y, x = np.mgrid[: weights.shape[0], : weights.shape[1]]
-    return np.array([(x * weights).sum(), (y * weights).sum()]) / max(float(weights.sum()), 1e-9)

@@ -90,7 +90,7 @@ class Pinhole:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values; `Pinhole.from_dict` reads them."""
-        return asdict(self)
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Pinhole:
@@ -202,8 +202,8 @@ def nearest_to_path(camera: Pinhole, pixel: Any, path: Floats) -> Floats:
 
 def solve_displacement(
     camera: Pinhole, place: Floats, shift: Any, growth: float | None, plane: Floats
-) -> Floats:
-    """The displacement (3,) in action units that explains a shift and a growth in the picture.
+) -> tuple[Floats, float]:
+    """The displacement in action units that explains a shift and a growth in the picture.
 
     Args:
         camera: calibrated.
@@ -211,6 +211,10 @@ def solve_displacement(
         shift: (x, y) px.
         growth: size after over size before; None to leave it out.
         plane: (3,) action units, standard deviations of displacements along each axis.
+
+    Returns:
+        (3,) action units; and the misfit: by how many standard deviations shift, growth and plane
+        disagree with it (the root of their sum of squares).
     """
     from scipy.optimize import least_squares
 
@@ -224,4 +228,5 @@ def solve_displacement(
             r.append(np.atleast_1d(np.log(nearer / growth) / _GROWTH_STD))
         return np.concatenate(r)
 
-    return cast("Floats", least_squares(residuals, np.zeros(3), max_nfev=40).x)
+    found = least_squares(residuals, np.zeros(3), max_nfev=40)
+    return cast("Floats", found.x), float(np.sqrt(2 * found.cost))

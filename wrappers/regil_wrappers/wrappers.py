@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from typing import Any, Literal, SupportsFloat, cast
 
 import gymnasium as gym
@@ -605,7 +606,7 @@ def _servo(
     actions: NDArray[np.float32],
     declared: dict[str, Any],
     disturbance: float,
-) -> Servo:
+) -> Servo | None:
     """A correction with what the user declared, else what the environment says, else defaults."""
     said = env.unwrapped.metadata.get("regil") or {}
     chosen = {
@@ -616,12 +617,12 @@ def _servo(
         chosen["gripper_dim"] = None
     space = cast("gym.spaces.Box", env.action_space)
     low, high = space.low.astype(np.float32), space.high.astype(np.float32)
-    return Servo(
-        size,
-        actions,
-        low,
-        high,
-        control_rate=said.get("control_rate"),
-        disturbance=disturbance,
-        **chosen,
-    )
+    rate = said.get("control_rate")
+    try:
+        return Servo(size, actions, low, high, control_rate=rate, disturbance=disturbance, **chosen)
+    except ValueError as error:
+        if any(value is not None for value in declared.values()):
+            raise
+        # Nobody declared anything: the environment is not one that correction is made for
+        warnings.warn(f"{error}; the guide replays without correction", stacklevel=3)
+        return None

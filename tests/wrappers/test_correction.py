@@ -1,0 +1,355 @@
+"""The corrected guide, on a hand and a square seen by a camera that the tests know exactly."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+import toy_camera
+from regil_wrappers import Demonstration, RetrievalGuideWrapper
+from toy_camera import HOME, ToyCamera
+
+
+@pytest.fixture(scope="module")
+def demo() -> Demonstration:
+    return toy_camera.record()
+
+
+@pytest.fixture(scope="module")
+def carried() -> Demonstration:
+    return toy_camera.record(task="carry")
+
+
+def guided(demo: Demonstration, correction: str = "servo", **settings: Any) -> Any:
+    own = {k: settings.pop(k) for k in ("mirror", "plane", "translation_dims") if k in settings}
+    own |= {k: settings.pop(k) for k in ("disturbance", "gripper_dim", "image") if k in settings}
+    return RetrievalGuideWrapper(ToyCamera(**settings), demo, correction=correction, **own)
+
+
+def play(env: Any, seed: int, ask: str = "guide_action") -> list[dict[str, Any]]:
+    """An episode that follows the guide: the infos."""
+    infos, over = [env.reset(seed=seed)[1]], False
+    while not over:
+        _, _, terminated, truncated, info = env.step(getattr(env, ask)())
+        infos.append(info)
+        over = terminated or truncated
+    return infos
+
+
+def calibrated(env: Any, seed: int = 100) -> Any:
+    while not env._servo.calibrated:
+        play(env, seed := seed + 1)
+    return env
+
+
+@pytest.fixture(scope="module")
+def known(demo: Demonstration) -> dict[str, Any]:
+    """A calibration, found once."""
+    return json.loads(json.dumps(calibrated(guided(demo)).calibration()))
+
+
+def ready(demo: Demonstration, known: dict[str, Any], **settings: Any) -> Any:
+    env = guided(demo, **settings)
+    env.set_calibration(known)
+    return env
+
+
+def successes(env: Any, seeds: range, ask: str = "guide_action") -> int:
+    return sum(play(env, seed, ask)[-1]["is_success"] for seed in seeds)
+
+
+def test_calibration_fits_into_the_first_episodes(demo: Demonstration) -> None:
+    env = guided(demo)
+    kinds, marked, moved = [], [], []
+    for seed in range(5):
+        infos = play(env, seed)
+        guides = [info["retrieval"]["guide"] for info in infos]
+        kinds.append(guides)
+        marked.append(infos[-1]["retrieval"]["calibrating"])
+        moved.append(np.abs(env.unwrapped.hand).max())
+    # 4 steps of rest, 4 for the gripper, 24 for each axis: 70 steps hold the gripper and two
+    assert marked == [True, True, False, False, False]
+    assert set(kinds[0]) == {"calibration"}
+    # an axis that was begun anew, and what is left of the episode
+    assert kinds[1] == ["calibration"] * 28 + ["plain"] * (len(kinds[1]) - 28)
+    for guides in kinds[2:]:
+        assert set(guides) in ({"corrected"}, {"plain"})
+    assert {"corrected"} in map(set, kinds[2:])
+    assert env.calibration() is not None
+
+
+def test_the_hand_is_put_back_between_calibration_moves(demo: Demonstration) -> None:
+    env = guided(demo)
+    env.reset(seed=0)
+    places = []
+    while env._servo.kind == "calibration":
+        _, _, terminated, truncated, _ = env.step(env.guide_action())
+        places.append(env.unwrapped.hand.copy())
+        if terminated or truncated:
+            env.reset(seed=0)
+    places = np.stack(places)
+    assert places.max() == pytest.approx(4)  # half of what the plane says
+    assert places.min() == pytest.approx(-4)
+    assert (np.sort(np.abs(places))[:, :2] < 1e-6).all()  # one axis at a time
+    np.testing.assert_allclose(places[-1], 0, atol=1e-6)
+
+
+def test_corrected_replay_reaches_where_plain_replay_fails(
+    demo: Demonstration, known: dict[str, Any]
+) -> None:
+    seeds = range(10)
+    assert successes(guided(demo, "none"), seeds) <= 1
+    assert successes(ready(demo, known), seeds) >= 9  # it tries plain replay now and then
+
+
+def test_the_displacement_is_that_of_the_square(demo: Demonstration, known: dict[str, Any]) -> None:
+    env, found = ready(demo, known), 0
+    for seed in range(10):
+        env.reset(seed=seed)
+        if env._servo.kind == "plain":
+            continue
+        found += 1
+        truth = env.unwrapped.square - HOME
+        assert np.linalg.norm(env._servo.target_shift - truth) < 0.6
+        path = env._servo.corrected_path()
+        # the demonstration itself ends up to 1.2 from the square
+        np.testing.assert_allclose(path[-1], env.unwrapped.square, atol=1.8)
+        assert np.linalg.norm(path[0]) < 4  # the correction grows, it does not jump
+    assert found >= 8
+
+
+def test_where_nothing_moved_it_is_the_demonstration(
+    demo: Demonstration, known: dict[str, Any]
+) -> None:
+    env = ready(demo, known, frozen=True)
+    assert demo.actions is not None
+    env.reset(seed=0)
+    for action in demo.actions:
+        np.testing.assert_allclose(env.guide_action(), action, atol=1e-5)
+        *_, info = env.step(env.guide_action())
+    assert info["is_success"]
+
+
+def test_another_light(demo: Demonstration, known: dict[str, Any]) -> None:
+    assert successes(ready(demo, known, light=0.8), range(5)) == 5
+
+
+@pytest.mark.parametrize("mirror", ["auto", -1])
+def test_mirrored_pictures(mirror: Any) -> None:
+    mirrored = toy_camera.record(look="mirrored")
+    env = guided(mirrored, look="mirrored", mirror=mirror)
+    calibrated(env)
+    assert set(env._servo.cameras) == ({1, -1} if mirror == "auto" else {-1})
+    assert successes(env, range(8)) >= 6
+
+
+def test_the_release_is_learned(carried: Demonstration) -> None:
+    """The goal stays where it was: with the correction kept, what is carried ends beside it."""
+    env = calibrated(guided(carried, task="carry"))
+    first = successes(env, range(8))
+    assert successes(env, range(8, 16)) >= max(first, 6)
+    ways = {way[0]: way[2:] for way in env.calibration()["ways"]}
+    assert ways["released"][0] > 6
+    assert ways["corrected"][1] > ways["corrected"][0] - 4
+
+
+def test_it_gives_way_to_plain_replay_by_its_own_evidence(demo: Demonstration) -> None:
+    """Only the picture of the square moves: who follows it fails."""
+    env = calibrated(guided(demo, decoy=True))
+    with pytest.warns(UserWarning, match="corrected replay succeeded in 0 of") as said:
+        successes(env, range(14))
+    assert len(said) == 1
+    assert "\n" not in str(said[0].message)
+    assert "mostly replays without correction" in env.calibration()["why"]
+    assert successes(env, range(20, 25)) >= 4
+    assert env.step(env.guide_action())[-1]["retrieval"]["guide"] == "plain"
+
+
+def test_who_does_not_follow_teaches_it_nothing(demo: Demonstration, known: Any) -> None:
+    env = ready(demo, known)
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    over = False
+    while not over:
+        action = rng.uniform(-1, 1, 4).astype(np.float32)
+        _, _, terminated, truncated, _ = env.step(action)
+        over = terminated or truncated
+    assert env.calibration()["ways"] == known["ways"]
+    play(env, 1)
+    assert env.calibration()["ways"] != known["ways"]
+
+    fresh = guided(demo)
+    for _ in range(2):  # calibration moves that somebody else makes are none
+        fresh.reset(seed=0)
+        for _ in range(50):
+            *_, info = fresh.step(np.zeros(4, np.float32))
+        assert info["retrieval"]["guide"] == "plain"
+    assert not fresh._servo.calibrated
+    assert fresh.calibration() is None
+    calibrated(fresh)
+    assert successes(fresh, range(3)) == 3
+
+
+def test_calibration_round_trip(demo: Demonstration, known: dict[str, Any]) -> None:
+    one, two = ready(demo, known), ready(demo, json.loads(json.dumps(known)))
+    assert one.calibration() == two.calibration() == known
+    for a, b in zip(play(one, 5), play(two, 5), strict=True):
+        np.testing.assert_array_equal(
+            a["retrieval"]["guide_action"], b["retrieval"]["guide_action"]
+        )
+        assert not a["retrieval"]["calibrating"]
+    assert one.calibration() == two.calibration()
+    # taken over in the middle of an episode, it is used from the next one on
+    late = guided(demo)
+    late.reset(seed=0)
+    late.set_calibration(known)
+    assert late._servo.kind == "plain"
+    assert play(late, 1)[0]["retrieval"]["guide"] == "corrected"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"cameras": []},
+        {"cameras": [{"focal": 3}]},
+        {"ways": []},
+        {"ways": [["corrected", 1, 2.0, 1.0]]},
+        {"ways": [["plain", 1, 1.0]]},
+        {"ways": [["plain", 1, -1.0, 2.0]]},
+        {"ways": [["sideways", 1, 1.0, 1.0], ["plain", 1, 1.0, 1.0]]},
+        {"ways": 3},
+        {"why": None, "cameras": 1},
+    ],
+)
+def test_a_damaged_calibration_is_refused(
+    demo: Demonstration, known: dict[str, Any], change: dict[str, Any]
+) -> None:
+    env = guided(demo)
+    with pytest.raises(ValueError, match="calibrat"):
+        env.set_calibration({**known, **change})
+    assert env.calibration() is None
+
+
+def test_a_calibration_from_other_pictures_is_refused(demo: Demonstration, known: Any) -> None:
+    small = [{**camera, "size": [64, 64]} for camera in known["cameras"]]
+    with pytest.raises(ValueError, match="not from pictures of 84x84"):
+        guided(demo).set_calibration({**known, "cameras": small})
+    with pytest.raises(ValueError, match="without correction takes no calibration"):
+        guided(demo, "none").set_calibration(known)
+    assert guided(demo, "none").calibration() is None
+
+
+def test_disturbed_episodes_come_back(demo: Demonstration, known: dict[str, Any]) -> None:
+    env = ready(demo, known, disturbance=3.0)
+    differ, inside = [], []
+    for seed in range(6):
+        env.reset(seed=seed)
+        pushed = kept = over = False
+        while not over:
+            clean, executed = env.guide_action(), env.disturbed_action()
+            np.testing.assert_array_equal(clean, env.guide_action())  # asking changes nothing
+            np.testing.assert_array_equal(executed, env.disturbed_action())
+            assert np.abs(executed).max() <= 1
+            assert executed[3] == clean[3]
+            pushed |= bool((clean != executed).any())
+            _, _, terminated, truncated, info = env.step(executed)
+            over = terminated or truncated
+            kept = info["is_success"]
+        differ.append(pushed)
+        inside.append(kept)
+    assert differ[0]  # every other episode
+    assert not any(differ[1::2])
+    assert sum(differ) >= 2
+    assert sum(inside) >= 5
+    calm = ready(demo, known)
+    calm.reset(seed=0)
+    np.testing.assert_array_equal(calm.disturbed_action(), calm.guide_action())
+
+
+def test_seeds_decide_everything(demo: Demonstration, known: dict[str, Any]) -> None:
+    runs = []
+    for _ in range(2):
+        env = ready(demo, known, disturbance=2.0)
+        runs.append([play(env, seed, "disturbed_action")[-1] for seed in range(3)])
+    for a, b in zip(*runs, strict=True):
+        assert a["retrieval"]["end"] == b["retrieval"]["end"]
+        assert a["retrieval"]["cost"] == b["retrieval"]["cost"]
+
+
+# -- what does not apply ---------------------------------------------------------------------------
+
+
+def one_line(env: Any, message: str, episodes: int = 6, seed: int = 0) -> None:
+    """It says so in one line, once, and goes on with plain replay."""
+    with pytest.warns(UserWarning, match=message) as said:
+        successes(env, range(seed, seed + episodes))
+    assert len(said) == 1
+    assert "\n" not in str(said[0].message)
+    assert env._servo.kind == "plain"
+    assert env.calibration()["why"] in str(said[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.unwrapped.frozen = True
+        assert play(env, 0)[-1]["is_success"]
+
+
+@pytest.mark.parametrize("dead", [0, 2])
+def test_a_dimension_that_does_not_move_the_hand(dead: int) -> None:
+    env = guided(toy_camera.record(), frozen=False)
+    env.unwrapped.dead = dead
+    with pytest.warns(UserWarning, match=f"action dimension {dead} does not move the hand") as said:
+        successes(env, range(5))
+    assert len(said) == 1
+    assert env._servo.kind == "plain"
+
+
+def test_absolute_actions(demo: Demonstration) -> None:
+    env = guided(demo, absolute=True)
+    with pytest.warns(UserWarning, match="dimension 0 does not move .* must be a delta"):
+        successes(env, range(5))
+    assert env._servo.kind == "plain"
+
+
+def test_episodes_too_short_to_calibrate_in(demo: Demonstration) -> None:
+    env = guided(demo, max_steps=27)
+    with pytest.warns(UserWarning, match="28 moves .* did not fit into any of 3 episodes") as said:
+        successes(env, range(6))
+    assert len(said) == 1
+    assert env._servo.kind == "plain"
+    assert not play(env, 7)[-1]["retrieval"]["calibrating"]
+
+
+def test_a_plane_that_the_pictures_contradict(demo: Demonstration) -> None:
+    env = guided(demo, plane=[0.3, 10.0, 10.0])
+    calibrated(env)
+    one_line(env, r"plane=\[0.3, 10.0, 10.0\]: in 3 episodes no displacement in this plane")
+
+
+def test_a_mirror_sign_that_calibration_contradicts() -> None:
+    env = guided(toy_camera.record(distance=0.45), mirror=-1, distance=0.45)
+    one_line(env, "mirror=-1: calibration says 1 .*replays without correction")
+
+
+def test_something_else_in_its_place_is_replayed_plainly(
+    demo: Demonstration, known: dict[str, Any]
+) -> None:
+    env = ready(demo, known)
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 255, (20, 20, 3)).astype(np.uint8)
+
+    class Papered(ToyCamera):
+        def render(self) -> np.ndarray:
+            picture = super().render()
+            picture[52:72, 30:50] = noise
+            return picture
+
+    env = RetrievalGuideWrapper(Papered(), demo, correction="servo")
+    env.set_calibration(known)
+    for seed in range(3):
+        info = play(env, seed)[0]
+        found = env.displacement
+        assert found is None or found.ratio > 0.6
+        assert info["retrieval"]["guide"] in ("plain", "corrected")
