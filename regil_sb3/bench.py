@@ -187,27 +187,37 @@ def _compare(
 
 TABLES: dict[str, Callable[[], list[Row]]] = {"rendering": rendering, "retrieval": retrieval}
 """Tables by name."""
+_EPISODES = ("ranking", "guide", "success-buffer")
 
 
-def main(table: str) -> list[Row]:
+def main(table: str, **options: Any) -> list[Row]:
     """Measure a table and print it.
 
     Args:
-        table: one of `TABLES`, or "ranking" (`regil_sb3.bench_rewards`).
+        table: one of `TABLES`, "ranking" (`regil_sb3.bench_rewards`), "guide" or "success-buffer"
+            (`regil_sb3.bench_guide`).
+        **options: of the last two.
 
     Returns:
-        its rows; none for "ranking".
+        its rows; none for those of episodes, not of times.
 
     Raises:
-        ValueError: where there is no such table.
+        ValueError: where there is no such table, or it has no such option.
     """
-    if table == "ranking":  # of episodes, not of times
+    if table in ("guide", "success-buffer"):
+        from regil_sb3 import bench_guide
+
+        bench_guide.main(table, **options)
+        return []
+    if options:
+        raise ValueError(f"the table {table!r} has no option --{next(iter(options))}")
+    if table == "ranking":
         from regil_sb3 import bench_rewards
 
         bench_rewards.main()
         return []
     if table not in TABLES:
-        raise ValueError(f"table {table!r} is not one of {', '.join([*TABLES, 'ranking'])}")
+        raise ValueError(f"table {table!r} is not one of {', '.join([*TABLES, *_EPISODES])}")
     rows = TABLES[table]()
     width = max(len(row.what) for row in rows)
     print(f"{table:{width}}  median ms  times the first")

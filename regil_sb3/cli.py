@@ -86,7 +86,14 @@ def _parser() -> argparse.ArgumentParser:
     report.add_argument("-o", "--out", type=Path, help="file (RUN/report.html)")
 
     bench = commands.add_parser("bench", help="measure, as ratios in one run")
-    bench.add_argument("table", help="retrieval, rendering or ranking")
+    bench.add_argument(
+        "table", help="retrieval, rendering, ranking, guide or success-buffer; the last two take:"
+    )
+    bench.add_argument("--tasks", nargs="+", metavar="TASK", help="Meta-World's (the paper's 7)")
+    bench.add_argument("--seeds", nargs="+", type=int, help="of demonstrations (0 1; 0)")
+    bench.add_argument("--episodes", type=int, help="guide: goals of each (20)")
+    bench.add_argument("--disturbances", nargs="+", metavar="NAME", help="guide: (none)")
+    bench.add_argument("--steps", type=int, help="success-buffer: agent steps (5000)")
     return parser
 
 
@@ -253,7 +260,9 @@ def main(argv: list[str] | None = None) -> int:
         elif args.command == "bench":
             from regil_sb3 import bench
 
-            bench.main(args.table)
+            names = ("tasks", "seeds", "episodes", "disturbances", "steps")
+            given = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
+            bench.main(args.table, **given)
     except KeyboardInterrupt:
         return 130
     except (

@@ -26,6 +26,9 @@ def test_table_is_printed(monkeypatch, capsys):
 
 def test_unknown_table_gets_one_line():
     with pytest.raises(
-        ValueError, match=r"^table 'speed' is not one of rendering, retrieval, ranking$"
+        ValueError,
+        match=r"^table 'speed' is not one of rendering, retrieval, ranking, guide, success-buffer$",
     ):
         bench.main("speed")
+    with pytest.raises(ValueError, match=r"^the table 'retrieval' has no option --steps$"):
+        bench.main("retrieval", steps=3)

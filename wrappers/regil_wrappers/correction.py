@@ -290,6 +290,8 @@ class Servo:
         return {
             "cameras": [camera.as_dict() for camera in self.cameras.values()],
             "ways": [[w.kind, w.mirror, w.won, w.lost] for w in self._ways],
+            "translation_dims": self._dims,
+            "plane": self._plane.tolist(),
             "why": self.why,
         }
 

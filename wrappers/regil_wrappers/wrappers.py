@@ -345,6 +345,16 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
             return action
         return {**action, "guide": self._servo.kind, "calibrating": self._servo.calibrating}
 
+    @property
+    def target_shift(self) -> NDArray[np.float64] | None:
+        """(3,) action units: where this episode's target is believed to have gone; None: unknown.
+
+        Unknown without a correction, while it calibrates, and where it replays plainly.
+        """
+        if self._servo is None or self._servo.kind not in ("corrected", "released"):
+            return None
+        return self._servo.target_shift
+
     def calibration(self) -> dict[str, Any] | None:
         """What a correcting guide has learned about camera and task, as JSON values.
 
