@@ -353,3 +353,20 @@ def test_something_else_in_its_place_is_replayed_plainly(
         found = env.displacement
         assert found is None or found.ratio > 0.6
         assert info["retrieval"]["guide"] in ("plain", "corrected")
+
+
+def test_a_camera_that_moved_is_taken_out(demo: Demonstration) -> None:
+    env = calibrated(guided(demo, pan=(3.0, -2.0)))
+    with pytest.warns(UserWarning, match=r"camera has moved .* by \((2.9|3.0|3.1), -") as said:
+        reached = successes(env, range(8))
+    assert len(said) == 1
+    assert reached >= 7
+    assert env.calibration()["why"] == ""
+
+
+def test_another_scene(demo: Demonstration, known: dict[str, Any]) -> None:
+    env = ready(demo, known, pan=(40.0, 30.0))
+    with pytest.warns(UserWarning, match=r"% of the picture differ .* without correction") as said:
+        successes(env, range(3))
+    assert len(said) == 1
+    assert env._servo.kind == "plain"

@@ -7,10 +7,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from regil_wrappers.conditions import camera_shift, match_colours
 from regil_wrappers.registration import (
     Displacement,
     local_shift,
-    match_colours,
     moved_back,
     register,
 )
@@ -190,3 +190,63 @@ def test_pictures_that_do_not_compare(second: np.ndarray, shown: str) -> None:
     for call in (register, lambda a, b: local_shift(a, b, np.zeros(2))):
         with pytest.raises(ValueError, match=shown):
             call(scene(), second)
+
+
+# -- a camera that has moved -----------------------------------------------------------------------
+
+
+def turned(shift: Any, at: Any = HOME, extra: int = 20) -> np.ndarray:
+    """The scene, all of it shifted by px, with what comes into view at the border."""
+    wide = np.pad(scene(at), ((extra, extra), (extra, extra), (0, 0)), mode="reflect")
+    x, y = np.array([extra, extra]) - shift
+    matrix = np.array([[1, 0, -x], [0, 1, -y]], float)
+    return cv2.warpAffine(wide, matrix, (SIZE, SIZE))
+
+
+@pytest.mark.parametrize("shift", [(3, -3), (-4.5, 1.5), (0, 6.2), (1.2, 0)])
+def test_the_camera_has_moved(shift: tuple[float, float]) -> None:
+    for at in (HOME, HOME + np.array([9, -6])):
+        found = camera_shift(scene(), turned(shift, at))
+        np.testing.assert_allclose(found, shift, atol=0.3)
+    np.testing.assert_allclose(camera_shift(scene(), turned(shift)[:, :, ::1]), shift, atol=0.3)
+
+
+def test_the_camera_stands() -> None:
+    rng = np.random.default_rng(0)
+    for at in (HOME, HOME + np.array([14, -9])):
+        picture = scene(at)
+        noisy = (picture + rng.normal(0, 8, picture.shape)).clip(0, 255).astype(np.uint8)
+        dark = (picture * 0.8).astype(np.uint8)
+        for other in (picture, noisy, dark, turned((0.3, 0.2), at)):
+            np.testing.assert_array_equal(camera_shift(scene(), other), (0, 0))
+
+
+@pytest.mark.parametrize("camera", [(3.0, -3.0), (-4.5, 1.5)])
+def test_what_moved_is_found_beside_a_moved_camera(camera: tuple[float, float]) -> None:
+    found = register(scene(), turned(camera, HOME + np.array([9, 5])))
+    assert off_by(found, (9, 5)) < 0.7
+    assert found is not None
+    np.testing.assert_allclose(found.camera, camera, atol=0.3)
+    # as the camera sees it now
+    assert np.abs(found.point - HOME - camera).max() < 8
+    assert found.changed < 0.2
+
+
+def test_only_the_camera_has_moved() -> None:
+    found = register(scene(), turned((4.0, -2.0)))
+    assert found is not None
+    assert found.shift == (0, 0)
+    assert found.growth == 1
+    assert found.ratio == 0
+    back = moved_back(turned((4.0, -2.0)), found)
+    assert np.abs(back.astype(int) - scene())[8:-8, 8:-8].mean() < 3
+
+
+def test_another_place_is_mostly_changed() -> None:
+    elsewhere = cv2.resize(textured(SIZE, 30), (SIZE, SIZE)).astype(np.uint8)
+    found = register(scene(), elsewhere)
+    assert found is not None
+    assert found.changed > 0.5
+    near = register(scene(), scene(HOME + np.array([9, 5])))
+    assert near is not None
+    assert near.changed < 0.15

@@ -38,6 +38,7 @@ _WORST_RATIO = 0.95  # a registration that explains less is not believed
 _KICK_EVERY = 10  # steps of a disturbed episode, on average
 _DISTURBED = 0.5  # of a full action: a replay that was disturbed by no more is a replay
 _MISFIT = 4.0  # std: a displacement that fits picture and plane worse is not believed
+_ELSEWHERE = 0.35  # of the picture: where more has changed, it is not one thing that moved
 _OFTEN = 3  # episodes in which that happens before it is said
 _ENOUGH = 6  # corrected episodes before plain replay is said to be better
 
@@ -330,6 +331,14 @@ class Servo:
         # Every other episode goes undisturbed, and tells which way of replaying is best
         self._disturbs = not self._disturbs and self._disturbance > 0
         if self._way.kind == "plain" or found is None:
+            return
+        if found.changed > _ELSEWHERE:
+            self._way = self._plain()
+            if not self.why:
+                self._say(
+                    f"{found.changed:.0%} of the picture differ from the demonstration's: camera "
+                    "or scene are others; the guide replays without correction while that lasts"
+                )
             return
         shift, misfit = self._solved(found)
         if found.ratio > _WORST_RATIO:

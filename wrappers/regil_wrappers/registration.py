@@ -5,7 +5,9 @@
   centre) in the other
 * ``local_shift`` - the shift of what stands round one point, for pictures that follow each other
 * ``moved_back`` - a picture warped so that what moved stands where it stood
-* ``match_colours`` - takes a change of brightness or colour out
+
+A change of the light, and a camera that has turned a little, are taken out first
+(`regil_wrappers.conditions`).
 
 Points are (x, y) in pixels, x to the right and y down. Lengths below that are given "at 84 pixels"
 grow with the shorter side of the picture.
@@ -21,7 +23,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Displacement", "local_shift", "match_colours", "moved_back", "register"]
+from regil_wrappers.conditions import camera_shift, match_colours
+
+__all__ = ["Displacement", "local_shift", "moved_back", "register"]
 
 Picture = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -31,7 +35,6 @@ _DIFFERENT = 25.0  # of 255: a pixel that differs by more in some channel has ch
 _TRUNCATION = 76.5  # of 255: an error counts no more than this, so that what is hidden costs little
 _SMALLEST = 12  # changed pixels at 84 pixels; fewer: nothing has moved
 _SPECK = 4  # connected changed pixels at 84 pixels; fewer are noise
-_UNEVEN = 12.0  # std of a channel; an evener one cannot tell a gain, only an offset
 _HULL_WEIGHT = 0.2  # of the unchanged pixels between changed ones
 _COARSE = 42  # side of the pictures of the coarse search
 _REACH = 14  # how far it looks, in pixels of these
@@ -45,44 +48,22 @@ class Displacement:
     """What moved between two pictures.
 
     Attributes:
-        point: (x, y) px, where it stood in the first picture.
+        point: (x, y) px, where it stood at the time of the first picture, as the camera of the
+            second sees it.
         shift: (x, y) px, from there to where it stands in the second.
         growth: its size in the second picture over that in the first.
         ratio: error left after moving it back, over the error before; near 0 is a good match, and
             near 1 no match at all.
+        changed: share of the picture's pixels that differ, once light and camera are taken out.
+        camera: (x, y) px, how far what stands still has shifted, because the camera moved.
     """
 
     point: tuple[float, float]
     shift: tuple[float, float]
     growth: float
     ratio: float
-
-
-def match_colours(reference: Picture, picture: Picture) -> Floats:
-    """Gain and offset of each channel fitted robustly, and applied.
-
-    Args:
-        reference: (H, W, 3) uint8.
-        picture: (H, W, 3) uint8, mostly the same scene.
-
-    Returns:
-        (H, W, 3) float32 in [0, 255]: the picture in the reference's brightness and colours.
-    """
-    matched = picture.astype(np.float32)
-    for channel in range(3):
-        x = matched[..., channel].ravel()
-        y = reference[..., channel].astype(np.float32).ravel()
-        gain, offset = 1.0, 0.0
-        for threshold in (60.0, 25.0, 25.0):
-            same = np.abs(gain * x + offset - y) < threshold
-            if same.mean() < 0.07:
-                break
-            if x[same].std() < _UNEVEN:
-                offset = float(np.median(y[same] - gain * x[same]))
-                continue
-            gain, offset = np.polyfit(x[same], y[same], 1)
-        matched[..., channel] = np.clip(gain * x + offset, 0, 255).reshape(picture.shape[:2])
-    return matched
+    changed: float = 0.0
+    camera: tuple[float, float] = (0.0, 0.0)
 
 
 def register(reference: Picture, picture: Picture) -> Displacement | None:
@@ -90,24 +71,39 @@ def register(reference: Picture, picture: Picture) -> Displacement | None:
 
     Pixels that differ are taken, and the shift and growth sought that make both pictures agree on
     them, both ways: first on a grid over small pictures, then below a pixel on the pixels that the
-    grid's answer explains. One rigid thing is assumed to have moved; the rest stands still.
+    grid's answer explains. One rigid thing is assumed to have moved; the rest stands still, or
+    shifts by what a small turn of the camera makes of it.
 
     Args:
         reference: (H, W, 3) uint8, the first picture.
         picture: (H, W, 3) uint8, the second, from the same camera.
 
     Returns:
-        the displacement, or None where nothing has moved.
+        the displacement, or None where nothing has moved. Where only the camera has, a shift of 0.
 
     Raises:
         ValueError: if the pictures differ in shape or are not uint8 (H, W, 3).
     """
     _check(reference, picture)
+    unit = min(picture.shape[:2]) / 84
+    camera = camera_shift(reference, picture)
+    seen_by_both = None
+    if camera.any():
+        matrix = np.array([[1, 0, camera[0]], [0, 1, camera[1]]])
+        inside = np.ones(picture.shape[:2], np.uint8)
+        size = (picture.shape[1], picture.shape[0])
+        inside = np.asarray(cv2.warpAffine(inside, matrix, size, flags=cv2.INTER_NEAREST))
+        seen_by_both = inside.astype(np.uint8)
+        reference = _warped(reference, matrix, inverse=False)
     a, b = reference.astype(np.float32), match_colours(reference, picture)
-    unit = min(a.shape[:2]) / 84
-    found = _changed(a, b, unit)
+    share = float((np.abs(a - b).max(axis=2) > _DIFFERENT).mean())
+    turned = (float(camera[0]), float(camera[1]))
+    found = _changed(a, b, unit, seen_by_both)
     if found is None:
-        return None
+        if not camera.any():
+            return None
+        middle = ((picture.shape[1] - 1) / 2, (picture.shape[0] - 1) / 2)
+        return Displacement(middle, (0.0, 0.0), 1.0, 0.0, share, turned)
     changed, hull = found
     weights = np.maximum(cv2.dilate(changed, _square(3, unit)), hull * _HULL_WEIGHT)
     shift, growth = _coarse(a, b, weights, unit)
@@ -142,11 +138,15 @@ def register(reference: Picture, picture: Picture) -> Displacement | None:
         shift=(float(moved[0]), float(moved[1])),
         growth=float(growth),
         ratio=left / max(still, 1e-9),
+        changed=share,
+        camera=turned,
     )
 
 
 def moved_back(picture: Picture, displacement: Displacement | None) -> Picture:
-    """The picture shifted so that what moved stands where it stood; growth is left alone.
+    """The picture shifted so that what moved stands where it stood in the first picture.
+
+    Growth is left alone. Where the camera has moved too, its shift is taken back with it.
 
     Args:
         picture: (H, W, 3) uint8, like the second picture of `register`.
@@ -157,7 +157,7 @@ def moved_back(picture: Picture, displacement: Displacement | None) -> Picture:
     """
     if displacement is None:
         return picture
-    x, y = displacement.shift
+    x, y = np.add(displacement.shift, displacement.camera)
     return _warped(picture, np.array([[1, 0, x], [0, 1, y]]), inverse=True)
 
 
@@ -231,18 +231,36 @@ def _gaussian(picture: Floats, point: Point, radius: float) -> Floats:
     return weights
 
 
-def _changed(a: Floats, b: Floats, unit: float) -> tuple[Floats, Floats] | None:
-    """Pixels that differ, and their convex hull, a little larger; None where too few do."""
+def _changed(
+    a: Floats, b: Floats, unit: float, seen_by_both: NDArray[np.uint8] | None
+) -> tuple[Floats, Floats] | None:
+    """Pixels that differ, and their convex hull, a little larger; None where too few do.
+
+    Where the camera has moved (``seen_by_both``: what both pictures show), edges cannot be brought
+    to lie exactly on each other: there a thing counts only if some of its pixels differ from
+    everything within a pixel of them.
+    """
     changed = (np.abs(a - b).max(axis=2) > _DIFFERENT).astype(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
+    core = changed
+    if seen_by_both is not None:
+        near = _square(3, unit)
+        beyond = np.maximum(
+            np.maximum(b - cv2.dilate(a, near), cv2.erode(a, near) - b),
+            np.maximum(a - cv2.dilate(b, near), cv2.erode(b, near) - a),
+        )
+        changed *= seen_by_both
+        core = changed * (beyond.max(axis=2) > _DIFFERENT)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)
     small = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] < _SPECK * unit**2)
-    changed[np.isin(labels, small)] = 0
-    if changed.sum() < _SMALLEST * unit**2:
+    core[np.isin(labels, small)] = 0
+    if core.sum() < _SMALLEST * unit**2:
         return None
-    hull = np.zeros_like(changed)
-    points = cast("NDArray[np.int32]", cv2.findNonZero(changed))
+    if seen_by_both is not None:
+        core = cv2.dilate(core, _square(3, unit)).astype(np.uint8) * changed
+    hull = np.zeros_like(core)
+    points = cast("NDArray[np.int32]", cv2.findNonZero(core))
     cv2.fillConvexPoly(hull, cv2.convexHull(points), (1,))
-    return changed.astype(np.float32), cv2.dilate(hull, _square(5, unit)).astype(np.float32)
+    return core.astype(np.float32), cv2.dilate(hull, _square(5, unit)).astype(np.float32)
 
 
 def _matrix(centre: Point, shift: Point, growth: float) -> NDArray[np.float64]:

@@ -53,6 +53,7 @@ class _RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         self._frame: NDArray[np.uint8] | None = None
         self._first_frame: NDArray[np.uint8] | None = None
         self._displacement: Displacement | None = None
+        self._said_camera = False
         if frames is None:
             self.retriever: Retriever = env.get_wrapper_attr("retriever")
             return
@@ -130,8 +131,16 @@ class _RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         if self._first_frame is None:
             raise ValueError("there is no picture yet: call reset() of the environment")
         if not self._registered:
-            self._displacement = register(self._frames.recorded_first, self._first_frame)
+            self._displacement = found = register(self._frames.recorded_first, self._first_frame)
             self._registered = True
+            if found is not None and any(found.camera) and not self._said_camera:
+                self._said_camera = True
+                x, y = found.camera
+                warnings.warn(
+                    f"the camera has moved since the demonstration: what stands still is shifted "
+                    f"by ({x:.1f}, {y:.1f}) pixels, which is taken out",
+                    stacklevel=2,
+                )
         return self._displacement
 
     def _with_retrieval(self, info: dict[str, Any], **own: Any) -> dict[str, Any]:
