@@ -20,7 +20,7 @@ from torch import nn
 
 from regil_sb3 import TD3BC
 from regil_sb3.policies import ConvEncoder, random_shift
-from regil_sb3.training import keep_freed_memory
+from regil_sb3.process import keep_freed_memory
 
 SPACE = spaces.Box(0, 255, (6, 84, 84), np.uint8)
 ROUNDS = 20

@@ -167,11 +167,12 @@ def _whole(rate: float | None) -> float | None:
 def _train(args: argparse.Namespace) -> None:
     from regil_wrappers import Demonstration
 
-    from regil_sb3 import training
+    from regil_sb3 import process, training
+    from regil_sb3.run_folder import refuse_finished
     from regil_sb3.settings import encoder_size, make_settings
 
-    training.keep_freed_memory()
-    training.set_threads()
+    process.keep_freed_memory()
+    process.set_threads()
     if args.resume is None and not args.env:
         raise ValueError("--env is missing: name an environment, or --resume a run")
     if args.resume is not None and (args.env or args.set or args.steps or args.preset or args.demo):
@@ -184,7 +185,7 @@ def _train(args: argparse.Namespace) -> None:
             training.resume(run)
         else:
             settings = make_settings(args.env, args.preset, args.seed, args.steps, args.set)
-            training.refuse_finished(run)
+            refuse_finished(run)
             demo = args.demo or default_demo(args.env)
             if not demo.exists():
                 size = encoder_size(settings)
@@ -207,9 +208,9 @@ def _train(args: argparse.Namespace) -> None:
 
 
 def _evaluate(run: Path, episodes: int) -> None:
-    from regil_sb3 import training
+    from regil_sb3 import process, training
 
-    training.keep_freed_memory()
+    process.keep_freed_memory()
     if episodes < 1:
         raise ValueError(f"--episodes is {episodes}: at least 1 is needed")
     try:

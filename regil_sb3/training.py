@@ -4,29 +4,22 @@
 - ``TrainingCallback``: progress, evaluation on the selection seeds, the models on disk.
 - ``train``, ``resume``: learn in a run folder.
 - ``evaluate_run``: policy, guided replay and behaviour cloning on the same unseen seeds.
-- ``keep_freed_memory``, ``set_threads``: what makes updates on a CPU fast.
 """
 
 from __future__ import annotations
 
-import csv
-import ctypes
 import json
-import os
-import platform
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from io import BufferedWriter
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from regil_wrappers import Demonstration
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 from tqdm import tqdm
 
@@ -39,9 +32,18 @@ from regil_sb3.evaluation import (
     guide_act,
     policy_act,
 )
-from regil_sb3.replay_buffer import FrameReplayBuffer
+from regil_sb3.run_folder import (
+    AppendingCSV,
+    best_so_far,
+    load_buffers,
+    load_calibration,
+    refuse_finished,
+    replacing,
+    save_buffers,
+    save_calibration,
+    save_model,
+)
 from regil_sb3.settings import Settings
-from regil_sb3.success_buffer import SuccessBuffer
 from regil_sb3.td3bc import TD3BC
 
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
@@ -86,27 +88,6 @@ def action_repeat(env: VecEnv) -> int:
     return int(own.get("action_repeat", 1))
 
 
-class _AppendingCSV(CSVOutputFormat):
-    """SB3's CSV log, which goes on where an earlier part of the run stopped."""
-
-    def __init__(self, path: Path) -> None:
-        old = path.read_text(encoding="utf-8") if path.exists() else ""
-        super().__init__(str(path))
-        if old:
-            self.keys = old.splitlines()[0].split(",")
-            self.file.write(old)
-            self.file.flush()
-
-
-def _best_so_far(log: Path) -> float:
-    """The best evaluation of an earlier part of the run, or -1."""
-    if not log.exists():
-        return -1.0
-    with log.open(encoding="utf-8", newline="") as file:
-        rates = [row.get("eval/success_rate") or -1 for row in csv.DictReader(file)]
-    return max(map(float, rates), default=-1.0)
-
-
 class TrainingCallback(BaseCallback):
     """Shows progress, evaluates the policy as it learns, and keeps the models on disk.
 
@@ -120,7 +101,7 @@ class TrainingCallback(BaseCallback):
         self.run = run
         self.eval_env = env
         self.every, self.episodes = every, episodes
-        self.best = _best_so_far(run / "progress.csv")
+        self.best = best_so_far(run / "progress.csv")
         self._next = every
         self._first = True
         self._bar = tqdm(unit="step", dynamic_ncols=True)
@@ -190,71 +171,6 @@ class TrainingCallback(BaseCallback):
 
 
 @contextmanager
-def _replacing(path: Path) -> Iterator[BufferedWriter]:
-    """Write beside the old file, then replace it in one step: a failed write loses nothing."""
-    temporary = path.with_name(f".{path.name}")
-    with temporary.open("wb") as file:
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-
-
-def save_model(model: TD3BC, path: Path) -> None:
-    """Save a model; the old file stays until the new one is complete."""
-    with _replacing(path) as file:
-        model.save(file)
-
-
-def save_calibration(env: VecEnv, path: Path) -> None:
-    """Keep what a correcting guide has learned; nothing where there is none yet."""
-    if not env.has_attr("calibration"):
-        return
-    found = [c for c in env.env_method("calibration") if c is not None]
-    if found:
-        with _replacing(path) as file:
-            file.write(json.dumps(found[0], indent=1).encode())
-
-
-def load_calibration(env: VecEnv, path: Path) -> bool:
-    """Give every guide what ``save_calibration`` kept; whether there was such a file.
-
-    Raises:
-        ValueError: the file is damaged, or from another camera.
-    """
-    if not path.exists():
-        return False
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is damaged ({error}): remove it") from error
-    env.env_method("set_calibration", found)
-    return True
-
-
-def _save_buffers(model: TD3BC, path: Path) -> None:
-    """Save what ``resume`` needs; SB3's own replay buffers (no images) have no such form."""
-    if not isinstance(model.replay_buffer, FrameReplayBuffer):
-        return
-    buffers = {"success": model.success_buffer.state(), "replay": model.replay_buffer.state()}
-    arrays: dict[str, Any] = {
-        f"{name}/{k}": v for name, state in buffers.items() for k, v in state.items()
-    }
-    with _replacing(path) as file:
-        np.savez(file, **arrays)
-
-
-def _load_buffers(model: TD3BC, path: Path) -> None:
-    with np.load(path, allow_pickle=False) as arrays:
-        for name, buffer in (("success", model.success_buffer), ("replay", model.replay_buffer)):
-            prefix = f"{name}/"
-            state = {k.removeprefix(prefix): arrays[k] for k in arrays if k.startswith(prefix)}
-            if state:
-                assert isinstance(buffer, SuccessBuffer | FrameReplayBuffer)
-                buffer.load_state(state)
-
-
-@contextmanager
 def _environments(settings: Settings, demo: Path) -> Iterator[tuple[VecEnv, VecEnv]]:
     env = make_env(settings, demo)
     try:
@@ -265,18 +181,6 @@ def _environments(settings: Settings, demo: Path) -> Iterator[tuple[VecEnv, VecE
             eval_env.close()
     finally:
         env.close()
-
-
-def refuse_finished(run: Path) -> None:
-    """Never write over a run.
-
-    Raises:
-        ValueError: the folder holds one.
-    """
-    if (run / "config.yaml").exists():
-        raise ValueError(
-            f"{run} holds a run already: choose another --out, or go on with --resume {run}"
-        )
 
 
 def train(settings: Settings, demo: Demonstration, run: Path) -> None:
@@ -321,7 +225,7 @@ def resume(run: Path) -> Settings:
         )
     with _environments(settings, run / "demo.hdf5") as (env, eval_env):
         model = TD3BC.load(run / "model.zip", env=env, demo=Demonstration.load(run / "demo.hdf5"))
-        _load_buffers(model, run / "buffers.npz")
+        load_buffers(model, run / "buffers.npz")
         load_calibration(env, run / "calibration.json")
         _learn(model, settings, run, eval_env)
     return settings
@@ -331,14 +235,14 @@ def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> Non
     every = max(settings.steps // 6, 1)
     # The callback reads the log before it is reopened
     callback = TrainingCallback(run, eval_env, every, settings.eval_episodes)
-    formats = [_AppendingCSV(run / "progress.csv"), TensorBoardOutputFormat(str(run))]
+    formats = [AppendingCSV(run / "progress.csv"), TensorBoardOutputFormat(str(run))]
     model.set_logger(Logger(str(run), formats))
     fresh = model.num_timesteps == 0
     try:
         model.learn(settings.steps - model.num_timesteps, callback, reset_num_timesteps=fresh)
     except KeyboardInterrupt:
         save_model(model, run / "model.zip")
-        _save_buffers(model, run / "buffers.npz")
+        save_buffers(model, run / "buffers.npz")
         assert model.env is not None
         save_calibration(model.env, run / "calibration.json")
         raise
@@ -425,28 +329,9 @@ def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
             if name == "policy":
                 policy_result = result
         results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
-    with _replacing(run / "evaluation.json") as file:
+    with replacing(run / "evaluation.json") as file:
         file.write(json.dumps(results, indent=1).encode())
     episode = policy_result.first_episode({**demo.metadata, "seed": EVALUATION_SEED})
     if episode is not None:
         episode.save(run / "episode.hdf5")
     return results
-
-
-def set_threads() -> None:
-    """Let OMP_NUM_THREADS decide, where it is set, over torch's own choice."""
-    if os.environ.get("OMP_NUM_THREADS"):
-        th.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
-
-
-def keep_freed_memory() -> None:
-    """Stop glibc from handing freed tensors back to the system and asking for them again.
-
-    An update on a CPU frees and allocates tensors of up to 11 MB many times. Each page that comes
-    back from the system costs a page fault, altogether a quarter of the update
-    (docs/performance.md). At most 256 MiB of freed memory are kept. Without glibc nothing happens.
-    """
-    if platform.libc_ver()[0] == "glibc":
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-        mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD: the most that glibc accepts
-        mallopt(-1, 256 << 20)  # M_TRIM_THRESHOLD

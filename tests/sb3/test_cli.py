@@ -12,8 +12,9 @@ from regil_wrappers import Demonstration
 
 from regil_sb3 import TD3BC, training
 from regil_sb3.cli import main
+from regil_sb3.run_folder import save_model
 from regil_sb3.settings import Settings, make_settings, presets
-from regil_sb3.training import TrainingCallback, make_env, save_model
+from regil_sb3.training import TrainingCallback, make_env
 
 ENV = "regil/metaworld-button-press-v0"
 TINY = ["--set", "warmup_steps=150", "--set", "learning_starts=100", "--set", "bc_pretrain_steps=3",

@@ -6,7 +6,7 @@ import resource
 import pytest
 import torch as th
 
-from regil_sb3.training import keep_freed_memory
+from regil_sb3.process import keep_freed_memory
 
 
 def _page_faults() -> int:
