@@ -14,7 +14,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
@@ -189,6 +189,8 @@ class ImagePolicy(TD3Policy):
             alone, and is refused here.)
         q_trains_encoder: whether the actor's Q-term trains an encoder of the actor's own; if not,
             behaviour cloning alone does.
+        averaged: whether the target actor, a running average of the actor's weights, is what acts
+            and is evaluated: an actor's success jumps from one update to the next.
         random_shift: largest shift of the augmentation, in pixels; 0 turns it off.
         optimizer_kwargs: None is torch's fused Adam, three times faster on a CPU.
         **kwargs: the other arguments of SB3's ``TD3Policy``.
@@ -203,6 +205,7 @@ class ImagePolicy(TD3Policy):
         features_extractor_class: str | type[BaseFeaturesExtractor] = "conv",
         shared_encoder: bool = True,
         q_trains_encoder: bool = True,
+        averaged: bool = True,
         random_shift: int = 4,
         optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
@@ -228,6 +231,7 @@ class ImagePolicy(TD3Policy):
             optimizer_kwargs = {"fused": True}
         self.shared_encoder = shared_encoder
         self.q_trains_encoder = q_trains_encoder
+        self.averaged = averaged
         self.random_shift = random_shift
         super().__init__(
             observation_space,
@@ -264,9 +268,14 @@ class ImagePolicy(TD3Policy):
         data.update(
             shared_encoder=self.shared_encoder,
             q_trains_encoder=self.q_trains_encoder,
+            averaged=self.averaged,
             random_shift=self.random_shift,
         )
         return data
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        acts: th.Tensor = (self.actor_target if self.averaged else self.actor)(observation)
+        return acts
 
     def augment(self, observations: th.Tensor) -> th.Tensor:
         """Random shift of a batch of image observations (B, C, H, W)."""

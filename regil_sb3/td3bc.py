@@ -42,6 +42,9 @@ from regil_sb3.success_buffer import SuccessBuffer
 SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
 
 
+_AVERAGED = 10  # of the first BC updates: the average takes in about a tenth of those done
+
+
 class TD3BC(TD3):
     """TD3 that starts from one demonstration.
 
@@ -491,7 +494,7 @@ class TD3BC(TD3):
         )
 
     def pretrain_bc(self, steps: int, progress: Callable[[int], None] | None = None) -> None:
-        """Train the actor by the BC term alone, then set its target to it.
+        """Train the actor by the BC term alone; its target averages over the last updates.
 
         Args:
             steps: updates.
@@ -506,9 +509,10 @@ class TD3BC(TD3):
             self.actor.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self.actor.optimizer.step()
+            share = max(self.tau, _AVERAGED / (done + _AVERAGED))
+            polyak_update(self.actor.parameters(), self.actor_target.parameters(), share)
             if progress is not None:
                 progress(done)
-        self.actor_target.load_state_dict(self.actor.state_dict())
         self.logger.record("train/bc_loss", loss.item())
 
     def _require_finite(self, name: str, value: float) -> None:
