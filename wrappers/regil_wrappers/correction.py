@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from regil_wrappers.calibration import Calibration
 from regil_wrappers.pinhole import Pinhole, nearest_to_path, solve_displacement
 from regil_wrappers.registration import Displacement
+from regil_wrappers.ways import Way, Ways
 
 __all__ = ["Servo"]
 
@@ -40,36 +40,6 @@ _DISTURBED = 0.5  # of a full action: a replay that was disturbed by no more is 
 _MISFIT = 4.0  # std: a displacement that fits picture and plane worse is not believed
 _ELSEWHERE = 0.35  # of the picture: where more has changed, it is not one thing that moved
 _OFTEN = 3  # episodes in which that happens before it is said
-_ENOUGH = 6  # corrected episodes before plain replay is said to be better
-
-# Successes and failures that each way of replaying starts with, Beta(a, b): what is usually best is
-# tried first, and given up when it fails.
-_PRIORS = {"corrected": (4.0, 1.0), "released": (2.0, 1.0), "plain": (1.0, 1.5)}
-
-
-@dataclass
-class _Way:
-    """One way of replaying, and what came of it."""
-
-    kind: str  # "corrected", "released" or "plain"
-    mirror: int
-    won: float
-    lost: float
-
-    @property
-    def mean(self) -> float:
-        """Of the successes to be expected."""
-        return self.won / (self.won + self.lost)
-
-    @property
-    def successes(self) -> float:
-        """Seen, without those that it starts with."""
-        return self.won - _PRIORS[self.kind][0]
-
-    @property
-    def trials(self) -> float:
-        """Episodes seen."""
-        return self.won + self.lost - sum(_PRIORS[self.kind])
 
 
 class Servo:
@@ -154,7 +124,7 @@ class Servo:
             max(2, math.ceil(_SETTLE * (control_rate or 40.0))),
         )
         self.cameras: dict[int, Pinhole] = {}
-        self._ways = self._all_ways()
+        self._ways = Ways((), self._grasp() is not None)
         self.why = ""  # why replay is plain, where it is
         self._off_plane = 0
         self._begin_episode()
@@ -168,7 +138,7 @@ class Servo:
 
     # Of an episode
     target_shift: Floats  # action units: where the target is believed to have gone
-    _way: _Way
+    _way: Way
     _moving: bool  # calibration moves are under way
     _calibrated_here: bool
     _followed: bool  # whether every action was the guide's
@@ -176,19 +146,20 @@ class Servo:
     _hand: Floats  # (3,) action units from the start
     _kick: Floats  # (3,) action units that the hand is still to be pushed
 
-    def reset(self, displacement: Displacement | None = None) -> None:
+    def reset(self, displacement: Displacement | None = None, kind: str | None = None) -> None:
         """Begin an episode.
 
         Args:
             displacement: what `registration.register` found between the demonstration's first
                 picture and this episode's; not used before `calibrated`.
+            kind: "corrected", "released" or "plain" in place of a choice between them.
         """
         self._begin_episode()
         if self._calibration is not None:
             self._moving = True
             self._calibration.begin()
         else:
-            self._begin_replay(displacement)
+            self._begin_replay(displacement, kind)
 
     def disturbed(self) -> NDArray[np.float32] | None:
         """What to execute now where `action` is what to learn; None where they are the same."""
@@ -281,7 +252,8 @@ class Servo:
                 self._way.won += 1
             else:
                 self._way.lost += 1
-            self._compare()
+            if not self.why and (verdict := self._ways.verdict()):
+                self._say(verdict)
         self._followed = False  # once
 
     def state(self) -> dict[str, Any] | None:
@@ -290,7 +262,7 @@ class Servo:
             return None
         return {
             "cameras": [camera.as_dict() for camera in self.cameras.values()],
-            "ways": [[w.kind, w.mirror, w.won, w.lost] for w in self._ways],
+            "ways": self._ways.as_list(),
             "translation_dims": self._dims,
             "plane": self._plane.tolist(),
             "why": self.why,
@@ -304,21 +276,13 @@ class Servo:
         """
         try:
             cameras = [Pinhole.from_dict(values) for values in state["cameras"]]
-            ways = [_Way(str(k), int(m), float(w), float(n)) for k, m, w, n in state["ways"]]
+            ways = Ways.from_list(state["ways"], [camera.mirror for camera in cameras])
             why = str(state["why"])
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"not the state of a calibrated guide: {error}") from error
         height, width = self._size
         if any(camera.size != self._size for camera in cameras):
             raise ValueError(f"the calibration is not from pictures of {height}x{width}")
-        mirrors = {camera.mirror for camera in cameras}
-        if "plain" not in {way.kind for way in ways} or not all(
-            way.kind in _PRIORS
-            and (way.kind == "plain" or way.mirror in mirrors)
-            and min(way.won, way.lost) > 0
-            for way in ways
-        ):
-            raise ValueError("not the state of a calibrated guide: ways and cameras do not fit")
         self.cameras = {camera.mirror: camera for camera in cameras}
         self._ways, self.why = ways, why
         self._calibration = None
@@ -326,14 +290,14 @@ class Servo:
 
     # -- replaying -------------------------------------------------------------------------------
 
-    def _begin_replay(self, found: Displacement | None) -> None:
-        self._way = self._chosen()
+    def _begin_replay(self, found: Displacement | None, kind: str | None) -> None:
+        self._way = self._ways.choose(self._rng) if kind is None else self._ways.best(kind)
         # Every other episode goes undisturbed, and tells which way of replaying is best
         self._disturbs = not self._disturbs and self._disturbance > 0
         if self._way.kind == "plain" or found is None:
             return
         if found.changed > _ELSEWHERE:
-            self._way = self._plain()
+            self._way = self._ways.plain
             if not self.why:
                 self._say(
                     f"{found.changed:.0%} of the picture differ from the demonstration's: camera "
@@ -342,9 +306,9 @@ class Servo:
             return
         shift, misfit = self._solved(found)
         if found.ratio > _WORST_RATIO:
-            self._way = self._plain()
+            self._way = self._ways.plain
         elif misfit > _MISFIT:
-            self._way = self._plain()
+            self._way = self._ways.plain
             self._off_plane += 1
             if self._off_plane == _OFTEN:
                 self._say(
@@ -367,41 +331,11 @@ class Servo:
 
     def _take_over(self, calibration: Calibration) -> None:
         self.cameras = calibration.cameras
-        self._ways = self._all_ways()
+        self._ways = Ways(self.cameras, self._grasp() is not None)
         self._calibration, self._moving = None, False
-        self._way = self._plain()  # what is left of this episode
+        self._way = self._ways.plain  # what is left of this episode
         if calibration.why:
             self._say(f"{calibration.why}; the guide replays without correction")
-
-    def _compare(self) -> None:
-        """Say so, once, when plain replay has turned out to be better."""
-        corrected = [way for way in self._ways if way.kind != "plain"]
-        plain = self._plain()
-        tried = sum(way.trials for way in corrected)
-        if self.why or tried < _ENOUGH or any(way.mean > plain.mean for way in corrected):
-            return
-        won = sum(way.successes for way in corrected)
-        self._say(
-            f"corrected replay succeeded in {won:.0f} of {tried:.0f} episodes, plain replay in "
-            f"{plain.successes:.0f} of {plain.trials:.0f}: the guide mostly replays without "
-            "correction from here; are plane, mirror and translation_dims those of this task?"
-        )
-
-    def _chosen(self) -> _Way:
-        """Thompson sampling on the successes seen."""
-        draws = [self._rng.beta(way.won, way.lost) for way in self._ways]
-        return self._ways[int(np.argmax(draws))]
-
-    def _all_ways(self) -> list[_Way]:
-        ways = []
-        for mirror in self.cameras:
-            for kind in ("corrected", "released"):
-                if kind == "corrected" or self._grasp() is not None:
-                    ways.append(_Way(kind, mirror, *_PRIORS[kind]))
-        return [*ways, _Way("plain", 1, *_PRIORS["plain"])]
-
-    def _plain(self) -> _Way:
-        return next(way for way in self._ways if way.kind == "plain")
 
     def _grasp(self) -> int | None:
         """The step in which an open gripper closes; None where none does."""
@@ -417,7 +351,7 @@ class Servo:
         self._at = 0
         self._hand = np.zeros(3)
         self._kick = np.zeros(3)
-        self._way = self._plain()
+        self._way = self._ways.plain
         self.target_shift = np.zeros(3)
 
     def _idle(self) -> NDArray[np.float32]:
@@ -427,6 +361,15 @@ class Servo:
             first = self._actions[0, self._gripper]
             action[self._gripper] = first if abs(first) > 0.5 else self._low[self._gripper]
         return action
+
+    @property
+    def camera(self) -> Pinhole | None:
+        """The camera that this episode's correction believes in; None where replay is plain."""
+        return None if self._way.kind == "plain" else self.cameras[self._way.mirror]
+
+    def demonstrated_path(self) -> Floats:
+        """(T, 3) action units: the places that the demonstration goes through."""
+        return np.array(self._path)
 
     def corrected_path(self) -> Floats:
         """(T, 3) action units: the places that this episode's replay goes through."""
