@@ -378,6 +378,8 @@ def main(name: str, **options: Any) -> None:
     collected = []
     for row in success_buffer(**options):
         collected.append(row)
-        print(f"| {row.task} | {row.seed} | {row.steps} | {row.plain} | {row.corrected} |")
+        print(
+            f"| {row.task} | {row.seed} | {row.steps} | {row.plain} | {row.corrected} |", flush=True
+        )
     means = [np.mean([getattr(row, side) for row in collected]) for side in ("plain", "corrected")]
     print(f"| **mean** | | | {means[0]:.0f} | {means[1]:.0f} |", flush=True)

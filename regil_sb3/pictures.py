@@ -1,6 +1,7 @@
 """Frames in, HTML out: a film player and the picture of an alignment, as data URIs.
 
 - `AlignedEpisode`: what the retriever saw in an episode.
+- `data_uri`: a picture as text.
 - `film_player`: the demonstration beside an episode, for the page's script to play.
 - `alignment_picture`: distances between the two and the aligned path, as inline SVG.
 
@@ -18,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration
 
-__all__ = ["AlignedEpisode", "alignment_picture", "film_player"]
+__all__ = ["AlignedEpisode", "alignment_picture", "data_uri", "film_player"]
 
 Image = npt.NDArray[np.uint8]
 _THUMBS = 8  # frames along each side of the alignment picture
@@ -32,7 +33,7 @@ class AlignedEpisode(NamedTuple):
     paths: list[list[tuple[int, int]]]  # a few windows' paths: (episode frame, demonstration frame)
 
 
-def _data_uri(image: Image, suffix: str) -> str:
+def data_uri(image: Image, suffix: str) -> str:
     """An (H, W, 3) RGB uint8 image as a data URI in the format ``suffix`` (".png" or ".jpg")."""
     done, code = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not done:
@@ -49,7 +50,7 @@ def _sprite(frames: Image) -> tuple[str, int]:
     sheet = np.zeros((lines * columns, height, width, 3), np.uint8)
     sheet[:count] = frames
     sheet = sheet.reshape(lines, columns, height, width, 3).swapaxes(1, 2)
-    return _data_uri(sheet.reshape(lines * height, columns * width, 3), ".jpg"), columns
+    return data_uri(sheet.reshape(lines * height, columns * width, 3), ".jpg"), columns
 
 
 def film_player(
@@ -111,7 +112,7 @@ def alignment_picture(
     # The root spreads the small distances apart, which are the ones the path chooses between.
     shade = np.sqrt(alignment.distances / max(alignment.distances.max(), 1e-12))
     colors = cv2.applyColorMap((255 * shade).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
-    picture = _data_uri(cv2.cvtColor(colors, cv2.COLOR_BGR2RGB), ".png")
+    picture = data_uri(cv2.cvtColor(colors, cv2.COLOR_BGR2RGB), ".png")
     thumb, size = 50, 50 * _THUMBS
     parts = []
     for film, down in ((demo, False), (episode, True)):
@@ -121,7 +122,7 @@ def alignment_picture(
             x, y = (0, thumb * (i + 1)) if down else (thumb * (i + 1), 0)
             parts.append(
                 f'<image x="{x}" y="{y}" width="{thumb - 2}" height="{thumb - 2}" '
-                f'href="{_data_uri(frame, ".jpg")}"/>'
+                f'href="{data_uri(frame, ".jpg")}"/>'
             )
 
     def points(path: Iterable[tuple[int, int]]) -> str:

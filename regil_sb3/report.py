@@ -24,6 +24,7 @@ from regil_wrappers.alignment import squared_distances
 from regil_wrappers.encoders import embed
 
 from regil_sb3.charts import Line, Point, line_chart
+from regil_sb3.guide_view import guide_picture, guide_view
 from regil_sb3.pictures import AlignedEpisode, alignment_picture, film_player
 
 __all__ = ["write_report"]
@@ -79,6 +80,14 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
             alignment = _align(demo, episode, config)
         except (ImportError, OSError, ValueError) as error:  # an encoder that is not installed here
             missing.append(f"alignment: {error}")
+    seen = ""
+    if (run / "calibration.json").is_file() and demo is not None and episode is not None:
+        try:
+            calibration: dict[str, Any] = _json(run / "calibration.json")
+            view = guide_view(demo, episode.frames[0], calibration)
+            seen = guide_picture(demo, episode.frames[0], view)
+        except (OSError, ValueError, KeyError) as error:
+            missing.append(f"calibration.json cannot be used: {' '.join(str(error).split())}")
     results = {name: evaluation[name] for name in METHODS if _successes(evaluation.get(name))}
     if evaluation:
         absent = [METHODS[name] for name in _EXPECTED if name not in results]
@@ -95,6 +104,7 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
     right = [
         _card("Demonstration and evaluation episode", film_player(demo, episode, alignment)),
         _card("Episodes", _strips(results, evaluation)),
+        _card("What the guide sees", seen),
         _card("Alignment", alignment_picture(demo, episode, alignment)),
     ]
     columns = "".join(f'<div class="column">{"".join(cards)}</div>' for cards in (left, right))

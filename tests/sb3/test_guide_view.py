@@ -1,0 +1,75 @@
+"""What the report shows of a correcting guide."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from regil_wrappers import RetrievalGuideWrapper
+
+from regil_sb3.guide_view import guide_picture, guide_view
+from regil_sb3.report import write_report
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "wrappers"))
+
+import toy_camera
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    demo = toy_camera.record()
+    env = RetrievalGuideWrapper(toy_camera.ToyCamera(), demo, correction="servo")
+    seed = 0
+    while env.calibration() is None:
+        _, over = env.reset(seed=(seed := seed + 1)), False
+        while not over:
+            *_, terminated, truncated, _ = env.step(env.guide_action())
+            over = terminated or truncated
+    return demo, json.loads(json.dumps(env.calibration()))
+
+
+def test_the_target_is_believed_where_it_is(calibrated):
+    demo, calibration = calibrated
+    env = toy_camera.ToyCamera()
+    for seed in range(4):
+        first, _ = env.reset(seed=seed)
+        view = guide_view(demo, first, calibration)
+        true = toy_camera.project(env.square)[0]
+        assert np.abs(view.believed - true).max() < 6  # of the square, the part that was seen
+        np.testing.assert_allclose(view.shift, env.square - toy_camera.HOME, atol=0.8)
+        assert view.path.shape == view.corrected.shape == (len(demo.actions), 2)
+        assert np.abs(view.corrected[-1] - true).max() < 4
+    picture = guide_picture(demo, first, view)
+    assert picture.count("<image") == 2
+    assert len(picture) < 40_000
+
+
+def test_where_it_would_not_correct_there_is_no_picture(calibrated):
+    demo, calibration = calibrated
+    assert guide_view(demo, demo.frames[0], calibration) is None  # nothing moved
+    plain = [way for way in calibration["ways"] if way[0] == "plain"]
+    first, _ = toy_camera.ToyCamera().reset(seed=1)
+    assert guide_view(demo, first, {**calibration, "cameras": [], "ways": plain}) is None
+    assert guide_picture(demo, first, None) == ""
+    with pytest.raises(ValueError, match="calibrat"):
+        guide_view(demo, first, {**calibration, "ways": []})
+    with pytest.raises(ValueError, match="translation_dims"):
+        guide_view(demo, first, {"ways": []})
+
+
+def test_the_report_shows_it(calibrated, tmp_path):
+    demo, calibration = calibrated
+    demo.save(tmp_path / "demo.hdf5")
+    other = toy_camera.ToyCamera()
+    first, _ = other.reset(seed=1)
+    episode = type(demo)(np.stack([first, *demo.frames[1:]]), actions=demo.actions)
+    episode.save(tmp_path / "episode.hdf5")
+    (tmp_path / "config.yaml").write_text("env: ToyCamera-v0\n")
+    assert "What the guide sees" not in write_report(tmp_path).read_text()
+    (tmp_path / "calibration.json").write_text(json.dumps(calibration))
+    assert "What the guide sees" in write_report(tmp_path).read_text()
+    (tmp_path / "calibration.json").write_text("{}")
+    assert "calibration.json cannot be used" in write_report(tmp_path).read_text()
