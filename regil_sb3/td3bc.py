@@ -91,7 +91,9 @@ class TD3BC(TD3):
         bc_floor: lambda's floor as a share of ``bc_coef``.
         bc_steps: steps until lambda would reach 0; None is the whole of ``learn``.
         bc_schedule: "time" as above; "success": lambda falls only while the policy's own recent
-            episodes succeed about as often as ever, and rises where they do not.
+            episodes succeed about as often as ever, and rises where they do not; Q comes in as
+            lambda falls, so that the actor begins, and where it got worse goes on, by behaviour
+            cloning alone.
         bc_loss: "mse" sums squared errors over action dimensions; "nll" is the Gaussian negative
             log likelihood with ``bc_std``, up to a constant.
         bc_std: std of that Gaussian, in actions scaled to [-1, 1].
@@ -473,6 +475,12 @@ class TD3BC(TD3):
         steps = self.bc_steps if self.bc_steps is not None else max(self._total_timesteps, 1)
         return self.bc_coef * by_time(self.num_timesteps, steps, self.bc_floor)
 
+    def q_coef_now(self) -> float:
+        """Weight of Q in the actor's loss at the present step."""
+        if self.bc_schedule == "success" and self.bc_coef > 0:
+            return self.q_coef * (1.0 - self._by_success.share)
+        return self.q_coef
+
     def _bc_term(self) -> th.Tensor:
         """Behaviour-cloning loss of a batch of the success buffer, a scalar."""
         seen, actions = self.success_buffer.sample(self.batch_size)
@@ -593,7 +601,8 @@ class TD3BC(TD3):
             # Delayed actor, Eq. 4
             if self._n_updates % self.policy_delay == 0 and trains_actor:
                 actor_loss = th.zeros((), device=self.device)
-                if self.q_coef > 0:
+                q_coef = self.q_coef_now()
+                if q_coef > 0:
                     # A shared encoder is trained by critic and BC term: here its features are fixed
                     with th.no_grad():
                         features = (
@@ -604,7 +613,7 @@ class TD3BC(TD3):
                     actions = self.actor.mu(seen)
                     q = self._actor_q(features, actions)
                     scale = q.abs().mean().detach().clamp(min=1e-8) if self.normalize_q else 1.0
-                    actor_loss = -self.q_coef * q.mean() / scale
+                    actor_loss = -q_coef * q.mean() / scale
                 if self.bc_coef > 0:
                     bc_term = self._bc_term()
                     bc_losses.append(bc_term.item())
@@ -628,6 +637,7 @@ class TD3BC(TD3):
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/bc_coef", self.bc_coef_now())
+        self.logger.record("train/q_coef", self.q_coef_now())
         if actor_losses:
             self.logger.record("train/actor_loss", np.mean(actor_losses))
         if bc_losses:

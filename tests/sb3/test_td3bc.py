@@ -497,3 +497,12 @@ def test_the_average_of_bc_updates_forgets_how_they_began():
     for name, value in model.actor.state_dict().items():
         assert th.allclose(model.actor_target.state_dict()[name], value, atol=2e-3), name
         assert not th.equal(begun[name], model.actor_target.state_dict()[name]), name
+
+
+def test_q_comes_in_as_the_bc_term_falls():
+    model = small(stacked(), bc_schedule="success", bc_coef=2.0, q_coef=0.5)
+    assert (model.bc_coef_now(), model.q_coef_now()) == (2.0, 0.0)
+    model._by_success.share = 0.25
+    assert (model.bc_coef_now(), model.q_coef_now()) == (0.5, 0.375)
+    by_time = small(stacked(), bc_coef=2.0, q_coef=0.5)
+    assert by_time.q_coef_now() == 0.5
