@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from regil_wrappers import Retriever, encoders, make_encoder, register_encoder
-from regil_wrappers.encoders import embed, encoder_names
+from regil_wrappers.encoders import cache, embed, encoder_names, registry, timm_networks
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (6, 84, 96, 3), dtype=np.uint8)
 
@@ -17,11 +17,11 @@ FRAMES = np.random.default_rng(0).integers(0, 256, (6, 84, 96, 3), dtype=np.uint
 @pytest.fixture(autouse=True)
 def fresh_caches(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(encoders, "_factories", dict(encoders._factories))
-    encoders._cache.clear()
+    monkeypatch.setattr(registry, "_factories", dict(registry._factories))
+    cache._cache.clear()
     make_encoder.cache_clear()
     yield
-    encoders._cache.clear()
+    cache._cache.clear()
     make_encoder.cache_clear()
 
 
@@ -86,7 +86,7 @@ def test_without_a_key_nothing_is_cached() -> None:
 def test_the_cache_forgets_the_oldest() -> None:
     for i in range(20):
         embed(Mean(f"mean {i}"), FRAMES)
-    assert len(encoders._cache) == encoders._CACHED_DEMONSTRATIONS
+    assert len(cache._cache) == cache._CACHED_DEMONSTRATIONS
 
 
 def test_pixels_needs_no_file(tmp_path: Path) -> None:
@@ -100,18 +100,18 @@ def test_slow_encoders_keep_a_file(tmp_path: Path) -> None:
     first = embed(encoder, FRAMES)
     (file,) = tmp_path.rglob("*.npz")
     assert file.parent == tmp_path / "regil"
-    encoders._cache.clear()
+    cache._cache.clear()
     np.testing.assert_array_equal(embed(encoder, FRAMES), first)
     assert encoder.encoded == 6
 
     # A damaged or foreign file is written again.
     for damage in (b"", b"PK\x03\x04 nothing", file.read_bytes()[:-30]):
-        encoders._cache.clear()
+        cache._cache.clear()
         file.write_bytes(damage)
         encoder.encoded = 0
         np.testing.assert_array_equal(embed(encoder, FRAMES), first)
         assert encoder.encoded == 6
-    encoders._cache.clear()
+    cache._cache.clear()
     np.savez(file, embeddings=np.array([{"a": 1}], dtype=object))
     np.testing.assert_array_equal(embed(encoder, FRAMES), first)
 
@@ -157,7 +157,7 @@ def test_without_torch_or_timm_one_line_says_what_to_install(
 def checkpoint(tmp_path: Path) -> str:
     """A tiny timm network's weights, written here: no download."""
     try:
-        timm, torch = encoders._import_timm()
+        timm, torch = timm_networks._import_timm()
     except ImportError as error:
         pytest.skip(str(error))
     torch.manual_seed(0)
@@ -196,7 +196,7 @@ def test_timm_standardises_by_the_networks_own_numbers(checkpoint: str) -> None:
 
 def test_timm_weights_are_part_of_the_key(checkpoint: str, tmp_path: Path) -> None:
     one = encoders.TimmEncoder("test_vit.r160_in1k", checkpoint)
-    timm, torch = encoders._import_timm()
+    timm, torch = timm_networks._import_timm()
     other = tmp_path / "other.pth"
     torch.manual_seed(1)
     torch.save(timm.create_model("test_vit.r160_in1k", pretrained=False).state_dict(), other)
@@ -218,7 +218,7 @@ def test_timm_bad_names_and_files(checkpoint: str, tmp_path: Path) -> None:
 def test_a_missing_download_says_which_file_to_get(
     checkpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    timm, _ = encoders._import_timm()
+    timm, _ = timm_networks._import_timm()
 
     def offline(*args: object, **kwargs: object) -> None:
         raise ConnectionError("no network\nand a long story")

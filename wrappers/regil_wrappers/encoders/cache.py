@@ -1,0 +1,101 @@
+"""``embed`` - the embeddings of a demonstration's frames, cached in the process and in files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from collections import OrderedDict
+from contextlib import suppress
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regil_wrappers.encoders.protocol import Encoder, check_embedding
+
+__all__ = ["embed"]
+
+_CACHED_DEMONSTRATIONS = 8
+_cache: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
+
+
+def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Embeddings of a demonstration's frames, from the cache where possible.
+
+    Frames are encoded one at a time, as they will be in an episode: a network's output depends in
+    its last bits on the size of the batch, and a frame must have distance 0 to itself.
+
+    Args:
+        encoder: cached by its ``cache_key`` together with the frames: in this process, and if it is
+            ``slow`` also in the folder ``regil`` of the user's cache (``XDG_CACHE_HOME``,
+            ``~/.cache``).
+        frames: (N, H, W, 3) uint8.
+
+    Returns:
+        (N, D) float32, not to be written to.
+
+    Raises:
+        ValueError: if the encoder's output has another shape or type, or is not finite.
+    """
+    key = getattr(encoder, "cache_key", None)
+    if key is None:
+        return _embed(encoder, frames)
+    digest = hashlib.sha256(f"{key} {frames.shape}".encode())
+    digest.update(np.ascontiguousarray(frames).data)
+    name = digest.hexdigest()
+    if name not in _cache:
+        file = _cache_folder() / f"{name}.npz" if getattr(encoder, "slow", False) else None
+        embeddings = None if file is None else _read_cached(file, len(frames))
+        if embeddings is None:
+            embeddings = _embed(encoder, frames)
+            if file is not None:
+                _write_cached(file, embeddings)
+        _cache[name] = embeddings
+        if len(_cache) > _CACHED_DEMONSTRATIONS:
+            _cache.popitem(last=False)
+    _cache.move_to_end(name)
+    return _cache[name]
+
+
+def _embed(encoder: Encoder, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+    rows = []
+    for i in range(len(frames)):
+        row = encoder.encode(frames[i : i + 1])
+        check_embedding(row, f"frame {i} of the demonstration")
+        rows.append(row)
+    embeddings = np.concatenate(rows)
+    embeddings.flags.writeable = False
+    return embeddings
+
+
+def _cache_folder() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "regil"
+
+
+def _read_cached(file: Path, frames: int) -> NDArray[np.float32] | None:
+    try:
+        # Opened here: np.load leaves a file open that it cannot read.
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            embeddings = archive["embeddings"]
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        return None  # not there, or not readable: it is only a cache, and is written again
+    if embeddings.dtype != np.float32 or embeddings.ndim != 2 or len(embeddings) != frames:
+        return None
+    if not np.isfinite(embeddings).all():
+        return None
+    embeddings.flags.writeable = False
+    return cast("NDArray[np.float32]", embeddings)
+
+
+def _write_cached(file: Path, embeddings: NDArray[np.float32]) -> None:
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as stream:
+            np.savez(stream, embeddings=embeddings)
+        temporary.replace(file)
+    except OSError:  # a full or read-only cache costs time, nothing else
+        with suppress(OSError):
+            temporary.unlink()
