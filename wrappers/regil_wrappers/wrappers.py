@@ -12,147 +12,26 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from typing import Any, Literal, SupportsFloat, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.core import ActType, ObsType
-from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from regil_wrappers.alignment import StepPattern
 from regil_wrappers.correction import Servo
 from regil_wrappers.demonstration import Demonstration
-from regil_wrappers.encoders import Encoder, make_encoder
-from regil_wrappers.frames import FrameSource, check_recorded_settings
-from regil_wrappers.registration import Displacement, moved_back, register
-from regil_wrappers.retrieval import Alignment, Retriever, check_settings
+from regil_wrappers.encoders import Encoder
+from regil_wrappers.guide_arguments import fitting_actions, make_servo
+from regil_wrappers.retrieval_wrapper import RetrievalWrapper, checked, label_of, settings_of
 from regil_wrappers.reward_signals import AT_EPISODE_END, AT_EVERY_STEP, make_signal
 from regil_wrappers.rewards import episode_scale
 
 __all__ = ["RetrievalGuideWrapper", "RetrievalRewardWrapper"]
 
 
-class _RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
-    """What both share. The innermost one owns the retriever and feeds it, those outside read it."""
-
-    _saved_kwargs: dict[str, Any]
-
-    def __init__(
-        self,
-        env: gym.Env[ObsType, ActType],
-        demo: Demonstration,
-        settings: dict[str, Any],
-        frames: FrameSource | None,
-    ) -> None:
-        gym.Wrapper.__init__(self, env)
-        self.demonstration = demo
-        self.retrieval_settings = settings
-        self._frames = frames
-        self._frame: NDArray[np.uint8] | None = None
-        self._first_frame: NDArray[np.uint8] | None = None
-        self._displacement: Displacement | None = None
-        self._said_camera = False
-        if frames is None:
-            self.retriever: Retriever = env.get_wrapper_attr("retriever")
-            return
-        encoder = settings["encoder"]
-        if isinstance(encoder, str):
-            encoder = make_encoder(encoder)
-        larger = getattr(encoder, "frame_size", None) is not None and frames.use_encoder_frames()
-        self.retriever = Retriever(
-            demo,
-            encoder,
-            settings["k"],
-            settings["horizon"],
-            settings["step_pattern"],
-            use_encoder_frames=larger,
-        )
-
-    @property
-    def alignment(self) -> Alignment:
-        """The alignment of the current frame; there is one from the first reset on."""
-        return self.retriever.alignment
-
-    @property
-    def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """What `gym.make` rebuilds the stack from; None with objects in place of names."""
-        # A path is saved as text; a Demonstration or an encoder object has no name to save.
-        if not all(isinstance(self._saved_kwargs[key], str) for key in ("demo", "encoder")):
-            return None
-        return super().spec
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[ObsType, dict[str, Any]]:
-        """Reset the environment and align its first frame."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        if self._frames is not None:
-            self.retriever.reset()
-            self._first_frame, self._displacement = None, None
-            self._align(observation)
-        return observation, info
-
-    def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Step the environment and align the frame that follows."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        if self._frames is not None:
-            self._align(observation)
-        return observation, reward, terminated, truncated, info
-
-    def _align(self, observation: ObsType) -> None:
-        assert self._frames is not None
-        self._frame = frame = self._frames.current(observation)
-        if self._first_frame is None:
-            self._first_frame = frame.copy()
-            self._registered = False
-        if self.retrieval_settings["register"]:
-            frame = moved_back(frame, self.displacement)
-        self.retriever.step(frame)
-
-    @property
-    def retrieval_frame(self) -> NDArray[np.uint8]:
-        """The picture aligned last, (H, W, 3) uint8, as the camera saw it."""
-        if self._frames is None:
-            frame = self.env.get_wrapper_attr("retrieval_frame")
-        elif (frame := self._frame) is None:
-            raise ValueError("there is no picture yet: call reset() of the environment")
-        return cast("NDArray[np.uint8]", frame)
-
-    @property
-    def displacement(self) -> Displacement | None:
-        """What moved between the demonstration's first picture and this episode's; None: nothing.
-
-        Found when it is first asked for in an episode (about 0.1 s).
-        """
-        if self._frames is None:
-            return cast("Displacement | None", self.env.get_wrapper_attr("displacement"))
-        if self._first_frame is None:
-            raise ValueError("there is no picture yet: call reset() of the environment")
-        if not self._registered:
-            self._displacement = found = register(self._frames.recorded_first, self._first_frame)
-            self._registered = True
-            if found is not None and any(found.camera) and not self._said_camera:
-                self._said_camera = True
-                x, y = found.camera
-                warnings.warn(
-                    f"the camera has moved since the demonstration: what stands still is shifted "
-                    f"by ({x:.1f}, {y:.1f}) pixels, which is taken out",
-                    stacklevel=2,
-                )
-        return self._displacement
-
-    def _with_retrieval(self, info: dict[str, Any], **own: Any) -> dict[str, Any]:
-        a = self.alignment
-        inner = info["retrieval"] if self._frames is None else {}
-        return {
-            **info,
-            "retrieval": {"start": a.start, "end": a.end, "cost": a.cost, **own, **inner},
-        }
-
-
-class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
+class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
     """Says at each step which action the demonstrator took where the agent is now.
 
     It never changes an action: whoever chooses actions asks `guide_action()`. Observations and
@@ -232,8 +111,8 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         mirror: Literal["auto", 1, -1] | None = None,
         disturbance: float = 0.0,
     ) -> None:
-        settings = _settings(demo, encoder, k, horizon, image, step_pattern, register)
-        loaded, frames = _checked(env, settings)
+        settings = settings_of(demo, encoder, k, horizon, image, step_pattern, register)
+        loaded, frames = checked(env, settings)
         if type(guide_offset) is not int:
             raise ValueError(f"guide_offset={guide_offset!r}: it must be a whole number of frames")
         if guide_patience is not None and (type(guide_patience) is not int or guide_patience < 1):
@@ -249,7 +128,9 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
                 f"disturbance={disturbance}: a guide without correction would not find its way "
                 "back, so set correction='servo' or disturbance=0"
             )
-        self._actions: NDArray[np.float32] = _guide_actions(env, loaded, _label(settings["demo"]))
+        self._actions: NDArray[np.float32] = fitting_actions(
+            env, loaded, label_of(settings["demo"])
+        )
 
         gym.utils.RecordConstructorArgs.__init__(
             self,
@@ -264,7 +145,7 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
             mirror=mirror,
             disturbance=disturbance,
         )
-        _RetrievalWrapper.__init__(self, env, loaded, settings, frames)
+        RetrievalWrapper.__init__(self, env, loaded, settings, frames)
 
         self.guide_offset = guide_offset
         self.guide_patience = guide_patience
@@ -278,7 +159,7 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
                 "plane": plane,
                 "mirror": mirror,
             }
-            self._servo = _servo(
+            self._servo = make_servo(
                 env, self.retriever.picture_size, self._actions, declared, disturbance
             )
 
@@ -382,7 +263,7 @@ class RetrievalGuideWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         self._servo.load_state(calibration)
 
 
-class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
+class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
     """Rewards following the demonstration.
 
     Known at every step, from nothing that comes later (`regil_wrappers.rewards`):
@@ -455,8 +336,8 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
         step_pattern: StepPattern = "symmetric",
         register: bool = False,
     ) -> None:
-        settings = _settings(demo, encoder, k, horizon, image, step_pattern, register)
-        loaded, frames = _checked(env, settings)
+        settings = settings_of(demo, encoder, k, horizon, image, step_pattern, register)
+        loaded, frames = checked(env, settings)
         for name, value, choices in (
             ("reward", reward, (*AT_EVERY_STEP, *AT_EPISODE_END)),
             ("mode", mode, ("replace", "add")),
@@ -476,7 +357,7 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
             weight=weight,
             divisor=divisor,
         )
-        _RetrievalWrapper.__init__(self, env, loaded, settings, frames)
+        RetrievalWrapper.__init__(self, env, loaded, settings, frames)
 
         self.mode = mode
         self.weight = weight
@@ -521,127 +402,3 @@ class RetrievalRewardWrapper(_RetrievalWrapper[ObsType, ActType], gym.utils.Reco
             own["episode_rewards"] = (self.weight * late).astype(np.float32)
             own["episode_scale"] = episode_scale(late)
         return observation, reward, terminated, truncated, self._with_retrieval(info, **own)
-
-
-def _settings(
-    demo: str | os.PathLike[str] | Demonstration,
-    encoder: str | Encoder,
-    k: int,
-    horizon: int,
-    image: str,
-    step_pattern: str,
-    register: bool,
-) -> dict[str, Any]:
-    """The arguments that decide an alignment, as a specification can hold them."""
-    return {
-        "demo": demo if isinstance(demo, Demonstration) else os.fspath(demo),
-        "encoder": encoder,
-        "k": k,
-        "horizon": horizon,
-        "image": image,
-        "step_pattern": step_pattern,
-        "register": register,
-    }
-
-
-def _checked(
-    env: gym.Env[Any, Any], settings: dict[str, Any]
-) -> tuple[Demonstration, FrameSource | None]:
-    """Refuse what does not fit, before any long work.
-
-    Returns:
-        the demonstration, and where frames come from: None if a retrieval wrapper further in takes
-        them.
-    """
-    demo = settings["demo"]
-    label = _label(demo)
-    if env.has_wrapper_attr("retrieval_settings"):
-        inside = env.get_wrapper_attr("retrieval_settings")
-        for name, value in settings.items():
-            other = inside[name]
-            if value is other or (isinstance(value, (str, int)) and value == other):
-                continue
-            raise ValueError(
-                f"{name}={_shown(value)}, but the retrieval wrapper inside has {_shown(other)}: "
-                f"wrappers in one stack share one alignment, give both the same"
-            )
-        return env.get_wrapper_attr("demonstration"), None
-    if not isinstance(demo, Demonstration):
-        demo = Demonstration.load(demo)
-    if not isinstance(settings["register"], bool):
-        raise ValueError(f"register={settings['register']!r}: it must be True or False")
-    check_settings(demo, settings["k"], settings["horizon"], settings["step_pattern"], label)
-    encoder = settings["encoder"]
-    if not isinstance(encoder, str) and not hasattr(encoder, "encode"):
-        raise ValueError(f"encoder={encoder!r}: give a name, or an object with encode(frames)")
-    check_recorded_settings(env, demo, label)
-    return demo, FrameSource(env, demo, label, settings["image"])
-
-
-def _label(demo: str | Demonstration) -> str:
-    return f"demo {demo!r}" if isinstance(demo, str) else "the demonstration"
-
-
-def _shown(value: Any) -> str:
-    return repr(value) if isinstance(value, (str, int)) else f"<{type(value).__name__}>"
-
-
-def _guide_actions(env: gym.Env[Any, Any], demo: Demonstration, label: str) -> NDArray[np.float32]:
-    """The demonstration's actions, once they are known to fit the environment."""
-    space = env.action_space
-    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-        raise ValueError(
-            f"the action space is {space}: a guide needs continuous actions, a Box of shape (A,)"
-        )
-    if demo.actions is None:
-        raise ValueError(f"{label} has no actions, so it cannot guide: record one that has")
-    if demo.actions.shape[1:] != space.shape:
-        raise ValueError(
-            f"{label} has actions of size {demo.actions.shape[1]} but the environment takes "
-            f"{space.shape[0]}: record it in this environment"
-        )
-    low, high = space.low.astype(np.float32), space.high.astype(np.float32)
-    outside = np.argwhere((demo.actions < low) | (demo.actions > high))
-    if len(outside):
-        i, a = outside[0]
-        raise ValueError(
-            f"{label} has action {demo.actions[i, a]:g} in dimension {a} of step {i} but the "
-            f"environment takes [{low[a]:g}, {high[a]:g}]: record it in this environment"
-        )
-    return demo.actions
-
-
-_DECLARED = {
-    "translation_dims": [0, 1, 2],
-    "gripper_dim": 3,
-    "plane": [10.0, 10.0, 0.5],
-    "mirror": "auto",
-}
-
-
-def _servo(
-    env: gym.Env[Any, Any],
-    size: tuple[int, int],
-    actions: NDArray[np.float32],
-    declared: dict[str, Any],
-    disturbance: float,
-) -> Servo | None:
-    """A correction with what the user declared, else what the environment says, else defaults."""
-    said = env.unwrapped.metadata.get("regil") or {}
-    chosen = {
-        name: value if value is not None else said.get(name, _DECLARED[name])
-        for name, value in declared.items()
-    }
-    if chosen["gripper_dim"] == "none":
-        chosen["gripper_dim"] = None
-    space = cast("gym.spaces.Box", env.action_space)
-    low, high = space.low.astype(np.float32), space.high.astype(np.float32)
-    rate = said.get("control_rate")
-    try:
-        return Servo(size, actions, low, high, control_rate=rate, disturbance=disturbance, **chosen)
-    except ValueError as error:
-        if any(value is not None for value in declared.values()):
-            raise
-        # Nobody declared anything: the environment is not one that correction is made for
-        warnings.warn(f"{error}; the guide replays without correction", stacklevel=3)
-        return None
