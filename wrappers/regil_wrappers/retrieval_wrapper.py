@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from typing import Any, SupportsFloat, cast
 
 import gymnasium as gym
@@ -14,11 +13,12 @@ from numpy.typing import NDArray
 
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.encoders import Encoder, make_encoder
+from regil_wrappers.episode import Episode
 from regil_wrappers.frames import FrameSource, check_recorded_settings
-from regil_wrappers.registration import Displacement, moved_back, register
+from regil_wrappers.registration import Displacement
 from regil_wrappers.retrieval import Alignment, Retriever, check_settings
 
-__all__ = ["RetrievalWrapper", "checked", "label_of", "settings_of"]
+__all__ = ["RetrievalWrapper", "checked", "label_of", "make_retriever", "settings_of"]
 
 
 class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
@@ -37,25 +37,11 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         self.demonstration = demo
         self.retrieval_settings = settings
         self._frames = frames
-        self._frame: NDArray[np.uint8] | None = None
-        self._first_frame: NDArray[np.uint8] | None = None
-        self._displacement: Displacement | None = None
-        self._said_camera = False
         if frames is None:
             self.retriever: Retriever = env.get_wrapper_attr("retriever")
             return
-        encoder = settings["encoder"]
-        if isinstance(encoder, str):
-            encoder = make_encoder(encoder)
-        larger = getattr(encoder, "frame_size", None) is not None and frames.use_encoder_frames()
-        self.retriever = Retriever(
-            demo,
-            encoder,
-            settings["k"],
-            settings["horizon"],
-            settings["step_pattern"],
-            use_encoder_frames=larger,
-        )
+        self.retriever = make_retriever(demo, settings, frames)
+        self._episode = Episode(self.retriever, frames, settings["register"])
 
     @property
     def alignment(self) -> Alignment:
@@ -76,36 +62,23 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         """Reset the environment and align its first frame."""
         observation, info = self.env.reset(seed=seed, options=options)
         if self._frames is not None:
-            self.retriever.reset()
-            self._first_frame, self._displacement = None, None
-            self._align(observation)
+            self._episode.begin()
+            self.retriever.step(self._episode.picture(observation))
         return observation, info
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the environment and align the frame that follows."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         if self._frames is not None:
-            self._align(observation)
+            self.retriever.step(self._episode.picture(observation))
         return observation, reward, terminated, truncated, info
-
-    def _align(self, observation: ObsType) -> None:
-        assert self._frames is not None
-        self._frame = frame = self._frames.current(observation)
-        if self._first_frame is None:
-            self._first_frame = frame.copy()
-            self._registered = False
-        if self.retrieval_settings["register"]:
-            frame = moved_back(frame, self.displacement)
-        self.retriever.step(frame)
 
     @property
     def retrieval_frame(self) -> NDArray[np.uint8]:
         """The picture aligned last, (H, W, 3) uint8, as the camera saw it."""
         if self._frames is None:
-            frame = self.env.get_wrapper_attr("retrieval_frame")
-        elif (frame := self._frame) is None:
-            raise ValueError("there is no picture yet: call reset() of the environment")
-        return cast("NDArray[np.uint8]", frame)
+            return cast("NDArray[np.uint8]", self.env.get_wrapper_attr("retrieval_frame"))
+        return self._episode.last
 
     @property
     def displacement(self) -> Displacement | None:
@@ -115,20 +88,7 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         """
         if self._frames is None:
             return cast("Displacement | None", self.env.get_wrapper_attr("displacement"))
-        if self._first_frame is None:
-            raise ValueError("there is no picture yet: call reset() of the environment")
-        if not self._registered:
-            self._displacement = found = register(self._frames.recorded_first, self._first_frame)
-            self._registered = True
-            if found is not None and any(found.camera) and not self._said_camera:
-                self._said_camera = True
-                x, y = found.camera
-                warnings.warn(
-                    f"the camera has moved since the demonstration: what stands still is shifted "
-                    f"by ({x:.1f}, {y:.1f}) pixels, which is taken out",
-                    stacklevel=2,
-                )
-        return self._displacement
+        return self._episode.displacement
 
     def _with_retrieval(self, info: dict[str, Any], **own: Any) -> dict[str, Any]:
         a = self.alignment
@@ -137,6 +97,22 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
             **info,
             "retrieval": {"start": a.start, "end": a.end, "cost": a.cost, **own, **inner},
         }
+
+
+def make_retriever(demo: Demonstration, settings: dict[str, Any], frames: FrameSource) -> Retriever:
+    """The retriever of these settings, of larger pictures where encoder and `frames` have such."""
+    encoder = settings["encoder"]
+    if isinstance(encoder, str):
+        encoder = make_encoder(encoder)
+    larger = getattr(encoder, "frame_size", None) is not None and frames.use_encoder_frames()
+    return Retriever(
+        demo,
+        encoder,
+        settings["k"],
+        settings["horizon"],
+        settings["step_pattern"],
+        use_encoder_frames=larger,
+    )
 
 
 def settings_of(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import Any, Literal, SupportsFloat, cast
+from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +23,7 @@ from regil_wrappers.alignment import StepPattern
 from regil_wrappers.correction import Servo
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.encoders import Encoder
+from regil_wrappers.guide import Guide
 from regil_wrappers.guide_arguments import fitting_actions, make_servo
 from regil_wrappers.retrieval_wrapper import RetrievalWrapper, checked, label_of, settings_of
 from regil_wrappers.reward_signals import AT_EPISODE_END, AT_EVERY_STEP, make_signal
@@ -128,9 +129,7 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
                 f"disturbance={disturbance}: a guide without correction would not find its way "
                 "back, so set correction='servo' or disturbance=0"
             )
-        self._actions: NDArray[np.float32] = fitting_actions(
-            env, loaded, label_of(settings["demo"])
-        )
+        actions = fitting_actions(env, loaded, label_of(settings["demo"]))
 
         gym.utils.RecordConstructorArgs.__init__(
             self,
@@ -149,8 +148,6 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
 
         self.guide_offset = guide_offset
         self.guide_patience = guide_patience
-        self._furthest = -1
-        self._waiting = 0
         self._servo: Servo | None = None
         if correction == "servo":
             declared = {
@@ -160,8 +157,9 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
                 "mirror": mirror,
             }
             self._servo = make_servo(
-                env, self.retriever.picture_size, self._actions, declared, disturbance
+                env, self.retriever.picture_size, actions, declared, disturbance
             )
+        self._guide = Guide(actions, guide_offset, guide_patience, self._servo)
 
     def guide_action(self) -> NDArray[np.float32]:
         """What the guide would do now: (A,) float32, in the environment's own units.
@@ -171,8 +169,8 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         Raises:
             ValueError: before the first reset.
         """
-        action = self._servo.action() if self._servo is not None else None
-        return self.plain_action() if action is None else action
+        _ = self.alignment
+        return self._guide.action()
 
     def disturbed_action(self) -> NDArray[np.float32]:
         """What to execute in place of `guide_action()`: (A,) float32.
@@ -183,8 +181,8 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         Raises:
             ValueError: before the first reset.
         """
-        action = self._servo.disturbed() if self._servo is not None else None
-        return self.guide_action() if action is None else action
+        _ = self.alignment
+        return self._guide.disturbed()
 
     def plain_action(self) -> NDArray[np.float32]:
         """The demonstrator's own action here: (A,) float32, in the environment's own units.
@@ -194,46 +192,26 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         Raises:
             ValueError: before the first reset.
         """
-        frame = self.alignment.end
-        if self.guide_patience is not None and self._waiting >= self.guide_patience:
-            frame = self._furthest + self._waiting - self.guide_patience
-        frame += self.guide_offset
-        return cast(
-            "NDArray[np.float32]", self._actions[min(max(frame, 0), len(self._actions) - 1)].copy()
-        )
+        _ = self.alignment
+        return self._guide.plain()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ObsType, dict[str, Any]]:
         """Reset; ``info["retrieval"]`` holds the alignment and the first guide action."""
         observation, info = super().reset(seed=seed, options=options)
-        self._furthest, self._waiting = self.alignment.end, 0
-        if self._servo is not None:
-            if seed is not None:
-                self._servo.reseed(seed)
-            self._servo.reset(self.displacement if self._servo.calibrated else None)
-        return observation, self._with_retrieval(info, **self._guidance())
+        self._guide.begin(self.alignment, lambda: self.displacement, seed)
+        return observation, self._with_retrieval(info, **self._guide.said())
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step with the given action; ``info["retrieval"]`` holds the guide's for the next step."""
         suggested = self.guide_action()
         observation, reward, terminated, truncated, info = super().step(action)
-        advanced = self.alignment.end > self._furthest
-        self._furthest = max(self._furthest, self.alignment.end)
-        self._waiting = 0 if advanced else self._waiting + 1
-        if self._servo is not None:
-            executed = np.asarray(action, np.float32)
-            self._servo.executed(executed, suggested, self.retrieval_frame)
-            if terminated or truncated:
-                self._servo.finish(bool(info.get("is_success", terminated)))
-        info = self._with_retrieval(info, **self._guidance())
+        over = terminated or truncated
+        success = bool(info.get("is_success", terminated)) if over else None
+        self._guide.after(action, suggested, self.alignment, self.retrieval_frame, success)
+        info = self._with_retrieval(info, **self._guide.said())
         return observation, reward, terminated, truncated, info
-
-    def _guidance(self) -> dict[str, Any]:
-        action = {"guide_action": self.guide_action()}
-        if self._servo is None:
-            return action
-        return {**action, "guide": self._servo.kind, "calibrating": self._servo.calibrating}
 
     @property
     def target_shift(self) -> NDArray[np.float64] | None:

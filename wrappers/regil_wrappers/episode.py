@@ -1,0 +1,87 @@
+"""One environment's current episode, held beside the demonstration.
+
+* ``Episode`` - its pictures, what has moved in them, and their alignment
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regil_wrappers.frames import FrameSource
+from regil_wrappers.registration import Displacement, moved_back, register
+from regil_wrappers.retrieval import Retriever
+
+__all__ = ["Episode"]
+
+
+class Episode:
+    """Gives a retriever the pictures of one environment, one episode after the other.
+
+    Call `begin` where an episode begins, then `picture` for each observation.
+
+    Args:
+        retriever: what the pictures are for.
+        frames: where they come from.
+        moves_back: whether they are moved back by what has moved since the demonstration began.
+    """
+
+    def __init__(self, retriever: Retriever, frames: FrameSource, moves_back: bool) -> None:
+        self.retriever = retriever
+        self.frames = frames
+        self._moves_back = moves_back
+        self._said_camera = False
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the last episode."""
+        self.retriever.reset()
+        self._last: NDArray[np.uint8] | None = None
+        self._first: NDArray[np.uint8] | None = None
+        self._registered = False
+        self._displacement: Displacement | None = None
+
+    def picture(self, observation: Any) -> NDArray[np.uint8]:
+        """The picture to align for this observation, (H, W, 3) uint8."""
+        self._last = seen = self.frames.current(observation)
+        if self._first is None:
+            self._first = seen.copy()
+        return moved_back(seen, self.displacement) if self._moves_back else seen
+
+    @property
+    def last(self) -> NDArray[np.uint8]:
+        """The last picture, (H, W, 3) uint8, as the camera saw it.
+
+        Raises:
+            ValueError: before the first one.
+        """
+        if self._last is None:
+            raise ValueError("there is no picture yet: call reset() of the environment")
+        return self._last
+
+    @property
+    def displacement(self) -> Displacement | None:
+        """What moved between the demonstration's first picture and this episode's; None: nothing.
+
+        Found when it is first asked for in an episode (about 0.1 s).
+
+        Raises:
+            ValueError: before the first picture.
+        """
+        if self._first is None:
+            raise ValueError("there is no picture yet: call reset() of the environment")
+        if not self._registered:
+            self._displacement = found = register(self.frames.recorded_first, self._first)
+            self._registered = True
+            if found is not None and any(found.camera) and not self._said_camera:
+                self._said_camera = True
+                x, y = found.camera
+                warnings.warn(
+                    f"the camera has moved since the demonstration: what stands still is shifted "
+                    f"by ({x:.1f}, {y:.1f}) pixels, which is taken out",
+                    stacklevel=2,
+                )
+        return self._displacement

@@ -1,0 +1,119 @@
+"""What a guide remembers while an episode goes on.
+
+* ``Guide`` - suggests one environment's actions, from where it is in the demonstration
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regil_wrappers.correction import Servo
+from regil_wrappers.registration import Displacement
+from regil_wrappers.retrieval import Alignment
+
+__all__ = ["Guide"]
+
+
+class Guide:
+    """Suggests actions: the demonstrator's where the agent is now, corrected or not.
+
+    Call `begin` with the alignment of an episode's first frame, then `after` each step.
+
+    Args:
+        actions: (T, A) float32, the demonstrator's.
+        offset: frames added to the aligned one.
+        patience: steps without progress after which the guide plays on; None: never.
+        servo: corrects actions for where the target is; None: nothing does.
+    """
+
+    def __init__(
+        self,
+        actions: NDArray[np.float32],
+        offset: int = 0,
+        patience: int | None = None,
+        servo: Servo | None = None,
+    ) -> None:
+        self._actions = actions
+        self._offset = offset
+        self._patience = patience
+        self.servo = servo
+        self._end = 0
+        self._furthest = -1
+        self._waiting = 0
+
+    def begin(
+        self,
+        alignment: Alignment,
+        displacement: Callable[[], Displacement | None],
+        seed: int | None = None,
+    ) -> None:
+        """Begin an episode.
+
+        Args:
+            alignment: of its first frame.
+            displacement: says what has moved since the demonstration began; asked only where a
+                correction uses it.
+            seed: of the correction's choices; None leaves their stream as it is.
+        """
+        self._end = self._furthest = alignment.end
+        self._waiting = 0
+        if self.servo is not None:
+            if seed is not None:
+                self.servo.reseed(seed)
+            self.servo.reset(displacement() if self.servo.calibrated else None)
+
+    def after(
+        self,
+        action: Any,
+        suggested: NDArray[np.float32],
+        alignment: Alignment,
+        picture: NDArray[np.uint8],
+        success: bool | None,
+    ) -> None:
+        """A step was made.
+
+        Args:
+            action: what was executed, (A,).
+            suggested: what `action` had said.
+            alignment: of the frame that followed.
+            picture: that frame, as the camera saw it.
+            success: whether the episode ended well; None: it goes on.
+        """
+        self._end = alignment.end
+        self._waiting = 0 if self._end > self._furthest else self._waiting + 1
+        self._furthest = max(self._furthest, self._end)
+        if self.servo is not None:
+            self.servo.executed(np.asarray(action, np.float32), suggested, picture)
+            if success is not None:
+                self.servo.finish(success)
+
+    def action(self) -> NDArray[np.float32]:
+        """What to do now, (A,) float32."""
+        corrected = self.servo.action() if self.servo is not None else None
+        return self.plain() if corrected is None else corrected
+
+    def disturbed(self) -> NDArray[np.float32]:
+        """What to execute now where `action` is what to learn, (A,) float32."""
+        pushed = self.servo.disturbed() if self.servo is not None else None
+        return self.action() if pushed is None else pushed
+
+    def plain(self) -> NDArray[np.float32]:
+        """The demonstrator's own action here, (A,) float32."""
+        frame = self._end
+        if self._patience is not None and self._waiting >= self._patience:
+            frame = self._furthest + self._waiting - self._patience
+        frame += self._offset
+        return cast(
+            "NDArray[np.float32]", self._actions[min(max(frame, 0), len(self._actions) - 1)].copy()
+        )
+
+    def said(self) -> dict[str, Any]:
+        """What ``info["retrieval"]`` holds of it."""
+        said: dict[str, Any] = {"guide_action": self.action()}
+        if self.servo is not None:
+            said |= {"guide": self.servo.kind, "calibrating": self.servo.calibrating}
+        return said
