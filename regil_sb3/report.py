@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 from regil_wrappers import Demonstration, Retriever
 from regil_wrappers.alignment import squared_distances
-from regil_wrappers.encoders import embed
+from regil_wrappers.encoders import embed, runs_code
 
 from regil_sb3.charts import Line, Point, line_chart
 from regil_sb3.guide_view import guide_picture, guide_view
@@ -188,6 +188,11 @@ def _successes(result: Any) -> list[bool]:
 def _align(demo: Demonstration, episode: Demonstration, config: dict[str, Any]) -> AlignedEpisode:
     """Walk the retriever through the episode's frames, with the run's own settings."""
     settings = {key: config[key] for key in ("encoder", "k", "horizon") if key in config}
+    if runs_code(str(settings.get("encoder", "pixels"))):
+        # The folder may be someone else's, and a report promises to run nothing of it.
+        raise ValueError(
+            f"encoder {settings['encoder']!r} names code to run, and a report runs none"
+        )
     retriever = Retriever(demo, **settings)
     frames = episode.frames
     if getattr(retriever.encoder, "frame_size", None) and demo.encoder_frames is not None:

@@ -160,7 +160,7 @@ def test_no_picture(demo_path: str, env: Any, image: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"encoder": "clip"}, r"unknown encoder 'clip': choose one of \['dinov2', 'dinov3'"),
+        ({"encoder": "clip"}, r"encoder 'clip': unknown: choose one of \['clip-"),
         ({"encoder": 3}, "encoder=3: give a name, or an object with encode"),
         ({"k": 0}, "k=0"),
         ({"horizon": "4"}, "horizon='4'"),

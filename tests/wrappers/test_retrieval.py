@@ -163,7 +163,7 @@ def test_strap_always_has_a_path() -> None:
         ({"horizon": -1}, "horizon=-1"),
         ({"horizon": 6}, r"6 frames, fewer than horizon \+ 1 = 7: choose horizon=5"),
         ({"step_pattern": "odd"}, "step_pattern='odd': choose one of"),
-        ({"encoder": "nothing"}, r"unknown encoder 'nothing': choose one of \['dinov2'"),
+        ({"encoder": "nothing"}, r"encoder 'nothing': unknown: choose one of \['clip-"),
         ({"use_encoder_frames": True}, "no encoder_frames"),
     ],
 )

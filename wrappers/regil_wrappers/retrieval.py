@@ -21,7 +21,7 @@ from regil_wrappers.alignment import (
     warping_path,
 )
 from regil_wrappers.demonstration import Demonstration
-from regil_wrappers.encoders import Encoder, check_embedding, embed, make_encoder
+from regil_wrappers.encoders import Encoder, check_embedding, embed, fitted, make_encoder
 
 __all__ = ["Alignment", "Retriever"]
 
@@ -90,7 +90,8 @@ class Retriever:
         frames = demo.encoder_frames if use_encoder_frames else demo.frames
         if frames is None:
             raise ValueError("use_encoder_frames: the demonstration has no encoder_frames")
-        self.encoder = make_encoder(encoder) if isinstance(encoder, str) else encoder
+        encoder = make_encoder(encoder) if isinstance(encoder, str) else encoder
+        self.encoder = fitted(encoder, frames)
         self.k = k
         self.horizon = horizon
         self.step_pattern: StepPattern = step_pattern

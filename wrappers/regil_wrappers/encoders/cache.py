@@ -6,13 +6,15 @@ import hashlib
 import os
 import zipfile
 from collections import OrderedDict
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from regil_wrappers.encoders.pca import Whitened
 from regil_wrappers.encoders.protocol import Encoder, check_embedding
 
 __all__ = ["embed"]
@@ -46,12 +48,11 @@ def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
     digest.update(np.ascontiguousarray(frames).data)
     name = digest.hexdigest()
     if name not in _cache:
-        file = _cache_folder() / f"{name}.npz" if getattr(encoder, "slow", False) else None
-        embeddings = None if file is None else _read_cached(file, len(frames))
-        if embeddings is None:
-            embeddings = _embed(encoder, frames)
-            if file is not None:
-                _write_cached(file, embeddings)
+        slow = getattr(encoder, "slow", False)
+        stored = load_arrays(name, {"embeddings": (len(frames), None)}) if slow else None
+        embeddings = _embed(encoder, frames) if stored is None else stored["embeddings"]
+        if slow and stored is None:
+            store_arrays(name, embeddings=embeddings)
         _cache[name] = embeddings
         if len(_cache) > _CACHED_DEMONSTRATIONS:
             _cache.popitem(last=False)
@@ -60,41 +61,59 @@ def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _embed(encoder: Encoder, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-    rows = []
-    for i in range(len(frames)):
-        row = encoder.encode(frames[i : i + 1])
-        check_embedding(row, f"frame {i} of the demonstration")
-        rows.append(row)
-    embeddings = np.concatenate(rows)
+    if isinstance(encoder, Whitened):
+        embeddings = encoder.transform(embed(encoder.encoder, frames))
+    else:
+        rows = []
+        for i in range(len(frames)):
+            row = encoder.encode(frames[i : i + 1])
+            check_embedding(row, f"frame {i} of the demonstration")
+            rows.append(row)
+        embeddings = np.concatenate(rows)
     embeddings.flags.writeable = False
     return embeddings
 
 
-def _cache_folder() -> Path:
+def cache_folder() -> Path:
+    """The folder ``regil`` of the user's cache: ``XDG_CACHE_HOME``, else ``~/.cache``."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "regil"
 
 
-def _read_cached(file: Path, frames: int) -> NDArray[np.float32] | None:
+def load_arrays(
+    name: str, shapes: Mapping[str, tuple[int | None, ...]]
+) -> dict[str, NDArray[np.float32]] | None:
+    """Arrays that `store_arrays` kept, not to be written to; None if there are none, or damaged.
+
+    Args:
+        name: what they were stored as.
+        shapes: of each array, None where any length will do. Theirs must be finite float32.
+    """
+    file = cache_folder() / f"{name}.npz"
     try:
         # Opened here: np.load leaves a file open that it cannot read.
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            embeddings = archive["embeddings"]
+            arrays = {key: archive[key] for key in shapes}
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None  # not there, or not readable: it is only a cache, and is written again
-    if embeddings.dtype != np.float32 or embeddings.ndim != 2 or len(embeddings) != frames:
-        return None
-    if not np.isfinite(embeddings).all():
-        return None
-    embeddings.flags.writeable = False
-    return cast("NDArray[np.float32]", embeddings)
+    for key, shape in shapes.items():
+        array = arrays[key]
+        fits = len(shape) == array.ndim and all(
+            want in (None, have) for want, have in zip(shape, array.shape, strict=True)
+        )
+        if not fits or array.dtype != np.float32 or not np.isfinite(array).all():
+            return None
+        array.flags.writeable = False
+    return arrays
 
 
-def _write_cached(file: Path, embeddings: NDArray[np.float32]) -> None:
+def store_arrays(name: str, **arrays: NDArray[np.float32]) -> None:
+    """Keep arrays in a file of the cache folder; where that cannot be written, nothing happens."""
+    file = cache_folder() / f"{name}.npz"
     temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as stream:
-            np.savez(stream, embeddings=embeddings)
+            np.savez(stream, **cast(dict[str, Any], arrays))
         temporary.replace(file)
     except OSError:  # a full or read-only cache costs time, nothing else
         with suppress(OSError):
