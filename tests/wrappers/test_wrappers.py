@@ -47,10 +47,11 @@ def test_a_replay_is_guided_and_rewarded_with_zero(demo: Demonstration) -> None:
 def test_info_is_a_few_plain_numbers(demo: Demonstration) -> None:
     env = RetrievalRewardWrapper(RetrievalGuideWrapper(ToyReach(), demo), demo)
     _, info = env.reset(seed=0)
-    assert set(info["retrieval"]) == {"start", "end", "cost", "guide_action"}
+    assert set(info["retrieval"]) == {"demonstration", "start", "end", "cost", "guide_action"}
     info = env.step(env.action_space.sample())[4]
     retrieval = info["retrieval"]
-    assert set(retrieval) == {"start", "end", "cost", "guide_action", "env_reward"}
+    own = {"demonstration", "start", "end", "cost", "guide_action", "env_reward"}
+    assert set(retrieval) == own
     assert info["is_success"] is False
     retrieval["guide_action"] = retrieval["guide_action"].tolist()
     assert json.loads(json.dumps(retrieval)) == retrieval

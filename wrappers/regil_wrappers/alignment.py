@@ -38,31 +38,38 @@ STEP_PATTERNS: dict[str, tuple[tuple[int, int], ...]] = {
 
 # Differences are taken block by block, so that they stay in the processor's cache.
 _BLOCK_BYTES = 256 * 1024
+_FEW = 256  # distances that are sorted as they are
 
 
 def squared_distances(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Squared Euclidean distance of one embedding to each of several.
+    """Squared Euclidean distance of one embedding, or of each of a batch, to each of several.
 
     The difference is taken first, so that an embedding's distance to itself is exactly 0 (the
     expanded product gives small negatives).
 
     Args:
-        x: (D,) float32, one embedding.
+        x: (D,) float32, one embedding; or (B, D), of which each gets what it gets alone.
         y: (N, D) float32, the others.
 
     Returns:
-        (N,) float64, not negative; summed in float32, so right to about 1e-6 of their value.
+        (N,) or (B, N) float64, not negative; summed in float32, so right to about 1e-6 of their
+        value.
 
     Raises:
         ValueError: if the shapes do not fit.
     """
-    if x.ndim != 1 or y.ndim != 2 or x.shape[0] != y.shape[1]:
-        raise ValueError(f"distances of shapes {x.shape} and {y.shape}: give (D,) and (N, D)")
-    distances = np.empty(len(y))
+    if x.ndim not in (1, 2) or y.ndim != 2 or x.shape[-1] != y.shape[1]:
+        raise ValueError(
+            f"distances of shapes {x.shape} and {y.shape}: give (D,) or (B, D), and (N, D)"
+        )
+    distances = np.empty((*x.shape[:-1], len(y)))
+    batch = [(x, distances)] if x.ndim == 1 else list(zip(x, distances, strict=True))
     rows = max(1, _BLOCK_BYTES // max(1, 4 * y.shape[1]))
     for first in range(0, len(y), rows):
-        difference = y[first : first + rows] - x
-        distances[first : first + rows] = np.einsum("nd,nd->n", difference, difference)
+        block = y[first : first + rows]
+        for one, row in batch:
+            difference = block - one
+            row[first : first + rows] = np.einsum("nd,nd->n", difference, difference)
     return distances
 
 
@@ -81,6 +88,11 @@ def nearest(distances: NDArray[np.float64], k: int) -> NDArray[np.intp]:
     """
     if not 1 <= k <= len(distances):
         raise ValueError(f"k={k} nearest of {len(distances)} frames: choose 1 to {len(distances)}")
+    if len(distances) > _FEW:
+        farthest = np.partition(distances, k - 1)[k - 1]
+        nearer = np.flatnonzero(distances < farthest)
+        ties = np.flatnonzero(distances == farthest)[len(nearer) - k :]
+        return np.sort(np.concatenate([nearer, ties]))
     # A stable sort keeps equal ones in order: seen from the end, the later frame comes first.
     latest_first = np.argsort(distances[::-1], kind="stable")[:k]
     return np.sort(len(distances) - 1 - latest_first)

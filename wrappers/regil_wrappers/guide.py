@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,13 @@ __all__ = ["Guide"]
 class Guide:
     """Suggests actions: the demonstrator's where the agent is now, corrected or not.
 
+    With several demonstrations, those of the one that is aligned with. The guide makes progress
+    where the aligned frame of a demonstration is beyond all of it that the episode has seen.
+
     Call `begin` with the alignment of an episode's first frame, then `after` each step.
 
     Args:
-        actions: (T, A) float32, the demonstrator's.
+        actions: of each demonstration, (T, A) float32.
         offset: frames added to the aligned one.
         patience: steps without progress after which the guide plays on; None: never.
         servo: corrects actions for where the target is; None: nothing does.
@@ -32,7 +35,7 @@ class Guide:
 
     def __init__(
         self,
-        actions: NDArray[np.float32],
+        actions: Sequence[NDArray[np.float32]],
         offset: int = 0,
         patience: int | None = None,
         servo: Servo | None = None,
@@ -41,8 +44,8 @@ class Guide:
         self._offset = offset
         self._patience = patience
         self.servo = servo
-        self._end = 0
-        self._furthest = -1
+        self._alignment: Alignment | None = None
+        self._furthest: dict[int, int] = {}  # frame of each demonstration that was aligned with
         self._waiting = 0
 
     def begin(
@@ -59,7 +62,8 @@ class Guide:
                 correction uses it.
             seed: of the correction's choices; None leaves their stream as it is.
         """
-        self._end = self._furthest = alignment.end
+        self._alignment = alignment
+        self._furthest = {alignment.demonstration: alignment.end}
         self._waiting = 0
         if self.servo is not None:
             if seed is not None:
@@ -83,33 +87,50 @@ class Guide:
             picture: that frame, as the camera saw it.
             success: whether the episode ended well; None: it goes on.
         """
-        self._end = alignment.end
-        self._waiting = 0 if self._end > self._furthest else self._waiting + 1
-        self._furthest = max(self._furthest, self._end)
+        self._alignment = alignment
+        furthest = self._furthest.get(alignment.demonstration, -1)
+        self._waiting = 0 if alignment.end > furthest else self._waiting + 1
+        self._furthest[alignment.demonstration] = max(furthest, alignment.end)
         if self.servo is not None:
             self.servo.executed(np.asarray(action, np.float32), suggested, picture)
             if success is not None:
                 self.servo.finish(success)
 
     def action(self) -> NDArray[np.float32]:
-        """What to do now, (A,) float32."""
+        """What to do now, (A,) float32.
+
+        Raises:
+            ValueError: before the first episode.
+        """
         corrected = self.servo.action() if self.servo is not None else None
         return self.plain() if corrected is None else corrected
 
     def disturbed(self) -> NDArray[np.float32]:
-        """What to execute now where `action` is what to learn, (A,) float32."""
+        """What to execute now where `action` is what to learn, (A,) float32.
+
+        Raises:
+            ValueError: before the first episode.
+        """
         pushed = self.servo.disturbed() if self.servo is not None else None
         return self.action() if pushed is None else pushed
 
     def plain(self) -> NDArray[np.float32]:
-        """The demonstrator's own action here, (A,) float32."""
-        frame = self._end
+        """The demonstrator's own action here, (A,) float32.
+
+        Raises:
+            ValueError: before the first episode.
+        """
+        if self._alignment is None:
+            raise ValueError(
+                "there is no alignment before the first frame: call reset() of the environment"
+            )
+        demo, frame = self._alignment.demonstration, self._alignment.end
         if self._patience is not None and self._waiting >= self._patience:
-            frame = self._furthest + self._waiting - self._patience
+            frame = self._furthest[demo] + self._waiting - self._patience
         frame += self._offset
-        return cast(
-            "NDArray[np.float32]", self._actions[min(max(frame, 0), len(self._actions) - 1)].copy()
-        )
+        actions = self._actions[demo]
+        action: NDArray[np.float32] = actions[min(max(frame, 0), len(actions) - 1)].copy()
+        return action
 
     def said(self) -> dict[str, Any]:
         """What ``info["retrieval"]`` holds of it."""

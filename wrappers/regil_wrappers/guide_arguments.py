@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import warnings
+from collections.abc import Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -11,13 +13,57 @@ from numpy.typing import NDArray
 
 from regil_wrappers.correction import Servo
 from regil_wrappers.demonstration import Demonstration
+from regil_wrappers.demonstrations import label_of
 
-__all__ = ["fitting_actions", "make_servo"]
+__all__ = ["check_guide", "fitting_actions", "make_servo"]
 
 
-def fitting_actions(env: gym.Env[Any, Any], demo: Demonstration, label: str) -> NDArray[np.float32]:
-    """The demonstration's actions, once they are known to fit the environment."""
-    space = env.action_space
+def check_guide(
+    guide_offset: int,
+    guide_patience: int | None,
+    correction: str,
+    disturbance: float,
+    demonstrations: int,
+) -> None:
+    """Refuse values that mean nothing, before any long work.
+
+    Raises:
+        ValueError: naming the argument, its value and what would be right.
+    """
+    if type(guide_offset) is not int:
+        raise ValueError(f"guide_offset={guide_offset!r}: it must be a whole number of frames")
+    if guide_patience is not None and (type(guide_patience) is not int or guide_patience < 1):
+        raise ValueError(f"guide_patience={guide_patience!r}: it must be at least 1 step, or None")
+    if correction not in ("none", "servo"):
+        raise ValueError(f"correction={correction!r}: choose one of ['none', 'servo']")
+    if not isinstance(disturbance, (int, float)) or not 0 <= disturbance < math.inf:
+        raise ValueError(f"disturbance={disturbance!r}: it must be a number of at least 0")
+    if disturbance > 0 and correction == "none":
+        raise ValueError(
+            f"disturbance={disturbance}: a guide without correction would not find its way "
+            "back, so set correction='servo' or disturbance=0"
+        )
+    if correction == "servo" and demonstrations > 1:
+        raise ValueError(
+            f"correction='servo' corrects the path of one demonstration and there are "
+            f"{demonstrations}: give one, or correction='none'"
+        )
+
+
+def fitting_actions(
+    space: gym.Space[Any], demos: Sequence[Demonstration], given: Any
+) -> list[NDArray[np.float32]]:
+    """The demonstrations' actions, once they are known to fit the action space.
+
+    Args:
+        space: of one environment.
+        demos: the demonstrations.
+        given: what ``demo=`` was, for messages.
+    """
+    return [_fitting(space, demos[i], label_of(given, i)) for i in range(len(demos))]
+
+
+def _fitting(space: gym.Space[Any], demo: Demonstration, label: str) -> NDArray[np.float32]:
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ValueError(
             f"the action space is {space}: a guide needs continuous actions, a Box of shape (A,)"
@@ -49,22 +95,31 @@ _DECLARED = {
 
 
 def make_servo(
-    env: gym.Env[Any, Any],
+    said: dict[str, Any],
+    space: gym.Space[Any],
     size: tuple[int, int],
     actions: NDArray[np.float32],
     declared: dict[str, Any],
     disturbance: float,
 ) -> Servo | None:
-    """A correction with what the user declared, else what the environment says, else defaults."""
-    said = env.unwrapped.metadata.get("regil") or {}
+    """A correction with what the user declared, else what the environment says, else defaults.
+
+    Args:
+        said: ``metadata["regil"]`` of the environment.
+        space: of its actions, a Box.
+        size: (height, width) px of the pictures.
+        actions: (T, A) float32, the demonstrator's.
+        declared: the user's own values by name; None for those not declared.
+        disturbance: as for `Servo`.
+    """
     chosen = {
         name: value if value is not None else said.get(name, _DECLARED[name])
         for name, value in declared.items()
     }
     if chosen["gripper_dim"] == "none":
         chosen["gripper_dim"] = None
-    space = cast("gym.spaces.Box", env.action_space)
-    low, high = space.low.astype(np.float32), space.high.astype(np.float32)
+    box = cast("gym.spaces.Box", space)
+    low, high = box.low.astype(np.float32), box.high.astype(np.float32)
     rate = said.get("control_rate")
     try:
         return Servo(size, actions, low, high, control_rate=rate, disturbance=disturbance, **chosen)

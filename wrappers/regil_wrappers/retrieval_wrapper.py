@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Sequence
 from typing import Any, SupportsFloat, cast
 
 import gymnasium as gym
@@ -12,13 +12,23 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from regil_wrappers.demonstration import Demonstration
+from regil_wrappers.demonstrations import Demonstrations, as_given, demonstrations, label_of
 from regil_wrappers.encoders import Encoder, make_encoder
 from regil_wrappers.episode import Episode
 from regil_wrappers.frames import FrameSource, check_recorded_settings
+from regil_wrappers.latency import Latency
 from regil_wrappers.registration import Displacement
 from regil_wrappers.retrieval import Alignment, Retriever, check_settings
 
-__all__ = ["RetrievalWrapper", "checked", "label_of", "make_retriever", "settings_of"]
+__all__ = [
+    "RetrievalWrapper",
+    "check_demonstrations",
+    "check_shared",
+    "checked",
+    "make_retriever",
+    "said_of",
+    "settings_of",
+]
 
 
 class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
@@ -29,18 +39,18 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
     def __init__(
         self,
         env: gym.Env[ObsType, ActType],
-        demo: Demonstration,
+        demos: Sequence[Demonstration],
         settings: dict[str, Any],
         frames: FrameSource | None,
     ) -> None:
         gym.Wrapper.__init__(self, env)
-        self.demonstration = demo
+        self.demonstrations = demos
         self.retrieval_settings = settings
         self._frames = frames
         if frames is None:
             self.retriever: Retriever = env.get_wrapper_attr("retriever")
             return
-        self.retriever = make_retriever(demo, settings, frames)
+        self.retriever = make_retriever(demos, settings, frames)
         self._episode = Episode(self.retriever, frames, settings["register"])
 
     @property
@@ -52,7 +62,9 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
         """What `gym.make` rebuilds the stack from; None with objects in place of names."""
         # A path is saved as text; a Demonstration or an encoder object has no name to save.
-        if not all(isinstance(self._saved_kwargs[key], str) for key in ("demo", "encoder")):
+        demo = self._saved_kwargs["demo"]
+        named = [self._saved_kwargs["encoder"], *(demo if isinstance(demo, list) else [demo])]
+        if not all(isinstance(name, str) for name in named):
             return None
         return super().spec
 
@@ -91,89 +103,128 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         return self._episode.displacement
 
     def _with_retrieval(self, info: dict[str, Any], **own: Any) -> dict[str, Any]:
-        a = self.alignment
         inner = info["retrieval"] if self._frames is None else {}
-        return {
-            **info,
-            "retrieval": {"start": a.start, "end": a.end, "cost": a.cost, **own, **inner},
-        }
+        return {**info, "retrieval": {**said_of(self.alignment), **own, **inner}}
 
 
-def make_retriever(demo: Demonstration, settings: dict[str, Any], frames: FrameSource) -> Retriever:
+def said_of(alignment: Alignment) -> dict[str, Any]:
+    """What ``info["retrieval"]`` holds of an alignment."""
+    a = alignment
+    return {"demonstration": a.demonstration, "start": a.start, "end": a.end, "cost": a.cost}
+
+
+def make_retriever(
+    demos: Sequence[Demonstration], settings: dict[str, Any], frames: FrameSource
+) -> Retriever:
     """The retriever of these settings, of larger pictures where encoder and `frames` have such."""
     encoder = settings["encoder"]
     if isinstance(encoder, str):
         encoder = make_encoder(encoder)
     larger = getattr(encoder, "frame_size", None) is not None and frames.use_encoder_frames()
     return Retriever(
-        demo,
+        demos,
         encoder,
         settings["k"],
         settings["horizon"],
         settings["step_pattern"],
         use_encoder_frames=larger,
+        search=settings["search"],
+        deadline_ms=settings["deadline_ms"],
     )
 
 
 def settings_of(
-    demo: str | os.PathLike[str] | Demonstration,
+    demo: Demonstrations,
     encoder: str | Encoder,
     k: int,
     horizon: int,
     image: str,
     step_pattern: str,
     register: bool,
+    search: str,
+    deadline_ms: float | None,
 ) -> dict[str, Any]:
     """The arguments that decide an alignment, as a specification can hold them."""
     return {
-        "demo": demo if isinstance(demo, Demonstration) else os.fspath(demo),
+        "demo": as_given(demo),
         "encoder": encoder,
         "k": k,
         "horizon": horizon,
         "image": image,
         "step_pattern": step_pattern,
         "register": register,
+        "search": search,
+        "deadline_ms": deadline_ms,
     }
 
 
 def checked(
     env: gym.Env[Any, Any], settings: dict[str, Any]
-) -> tuple[Demonstration, FrameSource | None]:
+) -> tuple[Sequence[Demonstration], FrameSource | None]:
     """Refuse what does not fit, before any long work.
 
     Returns:
-        the demonstration, and where frames come from: None if a retrieval wrapper further in takes
+        the demonstrations, and where frames come from: None if a retrieval wrapper further in takes
         them.
     """
-    demo = settings["demo"]
-    label = label_of(demo)
     if env.has_wrapper_attr("retrieval_settings"):
-        inside = env.get_wrapper_attr("retrieval_settings")
-        for name, value in settings.items():
-            other = inside[name]
-            if value is other or (isinstance(value, (str, int)) and value == other):
-                continue
-            raise ValueError(
-                f"{name}={_shown(value)}, but the retrieval wrapper inside has {_shown(other)}: "
-                f"wrappers in one stack share one alignment, give both the same"
-            )
-        return env.get_wrapper_attr("demonstration"), None
-    if not isinstance(demo, Demonstration):
-        demo = Demonstration.load(demo)
+        check_shared(settings, env.get_wrapper_attr("retrieval_settings"))
+        return env.get_wrapper_attr("demonstrations"), None
+    demos = demonstrations(settings["demo"])
+    check_demonstrations(env, demos, settings)
+    return demos, FrameSource(env, demos[0], label_of(settings["demo"]), settings["image"])
+
+
+def check_shared(settings: dict[str, Any], inside: dict[str, Any]) -> None:
+    """Refuse settings other than those of the retrieval wrapper inside.
+
+    Raises:
+        ValueError: naming the setting and both values.
+    """
+    for name, value in settings.items():
+        other = inside[name]
+        if value is other or (isinstance(value, (str, int, float, list)) and value == other):
+            continue
+        raise ValueError(
+            f"{name}={_shown(value)}, but the retrieval wrapper inside has {_shown(other)}: "
+            f"wrappers in one stack share one alignment, give both the same"
+        )
+
+
+def check_demonstrations(
+    env: gym.Env[Any, Any], demos: Sequence[Demonstration], settings: dict[str, Any]
+) -> None:
+    """Refuse settings, and demonstrations that do not fit them or were recorded otherwise.
+
+    Raises:
+        ValueError: naming what would be right.
+    """
     if not isinstance(settings["register"], bool):
         raise ValueError(f"register={settings['register']!r}: it must be True or False")
-    check_settings(demo, settings["k"], settings["horizon"], settings["step_pattern"], label)
+    if settings["register"] and len(demos) > 1:
+        raise ValueError(
+            f"register=True moves pictures back to where one demonstration's target stood, and "
+            f"there are {len(demos)}: give one, or register=False"
+        )
     encoder = settings["encoder"]
     if not isinstance(encoder, str) and not hasattr(encoder, "encode"):
         raise ValueError(f"encoder={encoder!r}: give a name, or an object with encode(frames)")
-    check_recorded_settings(env, demo, label)
-    return demo, FrameSource(env, demo, label, settings["image"])
-
-
-def label_of(demo: str | Demonstration) -> str:
-    """What messages call the demonstration: its file, where it has one."""
-    return f"demo {demo!r}" if isinstance(demo, str) else "the demonstration"
+    Latency(settings["deadline_ms"])
+    lengths, labels = [], []
+    for i in range(len(demos)):
+        demo = demos[i]
+        labels.append(label_of(settings["demo"], i))
+        lengths.append(len(demo))
+        check_recorded_settings(env, demo, labels[-1])
+    check_settings(
+        lengths,
+        settings["k"],
+        settings["horizon"],
+        settings["step_pattern"],
+        labels,
+        settings["search"],
+    )
 
 
 def _shown(value: Any) -> str:
-    return repr(value) if isinstance(value, (str, int)) else f"<{type(value).__name__}>"
+    return repr(value) if isinstance(value, (str, int, float)) else f"<{type(value).__name__}>"

@@ -2,6 +2,7 @@
 
 * ``Signal`` - rewards one episode after the other, from what a `Retriever` has seen
 * ``make_signal`` - one by name
+* ``check_search`` - whether it can be had with a way of searching
 * ``AT_EVERY_STEP``, ``AT_EPISODE_END`` - the names
 """
 
@@ -17,11 +18,15 @@ from regil_wrappers import rewards
 from regil_wrappers.alignment import squared_distances
 from regil_wrappers.retrieval import Retriever
 
-__all__ = ["AT_EPISODE_END", "AT_EVERY_STEP", "Signal", "make_signal"]
+__all__ = ["AT_EPISODE_END", "AT_EVERY_STEP", "Signal", "check_search", "make_signal"]
 
 
 class Signal:
     """Rewards the frames that a retriever is given. The first frame of an episode earns nothing.
+
+    With several demonstrations, "sdtw" is of the alignment that was chosen and "cos" of the nearest
+    frame of all; "progress" is the best of those that have a candidate, "orca" the best of all;
+    "pwil" transports to the frames of all together, "ot" and "tot" to the one that is cheapest.
 
     Args:
         retriever: whose current frame is rewarded.
@@ -58,7 +63,7 @@ class _Sdtw(Signal):
 
     @cached_property
     def scale(self) -> float:
-        return 1 / rewards.demonstration_tau(self.retriever.embeddings)
+        return 1 / rewards.demonstration_tau(self.retriever.memory.parts)
 
     def step(self) -> float:
         return rewards.sdtw_reward(self.retriever.alignment, self._horizon)
@@ -67,40 +72,48 @@ class _Sdtw(Signal):
 class _Progress(Signal):
     def __init__(self, retriever: Retriever) -> None:
         super().__init__(retriever)
-        self._tau = rewards.demonstration_tau(retriever.embeddings)
-        self._phi = rewards.arc_length(retriever.embeddings)
+        parts = retriever.memory.parts
+        self._tau = [rewards.demonstration_tau(part) for part in parts]
+        self._phi = [rewards.arc_length(part) for part in parts]
 
     def step(self) -> float:
-        return rewards.progress_reward(self.retriever.end_costs(), self._phi, self._tau)
+        return max(
+            rewards.progress_reward(self.retriever.end_costs(d), self._phi[d], self._tau[d])
+            for d in self.retriever.near
+        )
 
 
 class _Cos(Signal):
     def step(self) -> float:
-        r = self.retriever
-        return rewards.cos_reward(r.embedding, r.embeddings, r.distances)
+        nearest = self.retriever.embeddings[self.retriever.nearest]
+        return rewards.cos_reward(self.retriever.embedding, nearest[None], np.zeros(1))
 
 
 class _Orca(Signal):
     def __init__(self, retriever: Retriever) -> None:
         super().__init__(retriever)
-        self._tau = rewards.demonstration_tau(retriever.embeddings)
+        self._tau = [rewards.demonstration_tau(part) for part in retriever.memory.parts]
 
     def begin(self) -> None:
-        self._coverage = rewards.orca_step(None, self.retriever.distances, self._tau)
+        self._coverage: list[NDArray[np.float64] | None] = [None] * len(self._tau)
+        self.step()
 
     def step(self) -> float:
-        self._coverage = rewards.orca_step(self._coverage, self.retriever.distances, self._tau)
-        return rewards.orca_reward(self._coverage)
+        distances = np.split(self.retriever.distances, self.retriever.memory.starts[1:-1])
+        rows = zip(self._coverage, distances, self._tau, strict=True)
+        covered = [rewards.orca_step(*row) for row in rows]
+        self._coverage = [*covered]
+        return max(rewards.orca_reward(coverage) for coverage in covered)
 
 
 class _Pwil(Signal):
-    """T is the demonstration's length: a longer episode has nothing left to match, and earns 0."""
+    """T is the longest demonstration: a longer episode has nothing left to match, and earns 0."""
 
     def __init__(self, retriever: Retriever) -> None:
         super().__init__(retriever)
         self._standard = rewards.standard_scale(retriever.embeddings)
         self._frames = retriever.embeddings * self._standard
-        self._horizon = len(self._frames)
+        self._horizon = max(len(part) for part in retriever.memory.parts)
 
     @property
     def scale(self) -> float:
@@ -130,7 +143,8 @@ class _Transport(Signal):
     @property
     def scale(self) -> float:
         # `episode_scale` makes an episode's rewards sum to -10
-        return len(self.retriever.embeddings) / 10
+        memory = self.retriever.memory
+        return len(memory) / len(memory.parts) / 10
 
     def begin(self) -> None:
         self._episode = [self.retriever.embedding.copy()]
@@ -140,7 +154,9 @@ class _Transport(Signal):
         return 0.0
 
     def end(self) -> NDArray[np.float64]:
-        return self._of(np.stack(self._episode), self.retriever.embeddings)[1:]
+        episode = np.stack(self._episode)
+        of_each = [self._of(episode, part) for part in self.retriever.memory.parts]
+        return max(of_each, key=np.sum)[1:]
 
 
 _STEPWISE: dict[str, Callable[[Retriever], Signal]] = {
@@ -151,10 +167,25 @@ _STEPWISE: dict[str, Callable[[Retriever], Signal]] = {
 }
 _TRANSPORT = {"ot": rewards.ot_rewards, "tot": rewards.tot_rewards}
 
+_OF_ALL_FRAMES = ("orca", "pwil", *_TRANSPORT)
+
 AT_EVERY_STEP = ("sdtw", *_STEPWISE)
 """Rewards known at once, by name."""
 AT_EPISODE_END = tuple(_TRANSPORT)
 """Rewards that need the whole episode, by name."""
+
+
+def check_search(name: str, search: str) -> None:
+    """Refuse a reward that needs the distances to all frames where a search looks at some.
+
+    Raises:
+        ValueError: naming what would be right.
+    """
+    if search == "faiss" and name in _OF_ALL_FRAMES:
+        raise ValueError(
+            f"reward={name!r} compares with every frame of every demonstration and search='faiss' "
+            "does not: set search='exact', or choose 'sdtw', 'progress' or 'cos'"
+        )
 
 
 def make_signal(name: str, retriever: Retriever, horizon: int | None = None) -> Signal:
@@ -166,9 +197,10 @@ def make_signal(name: str, retriever: Retriever, horizon: int | None = None) -> 
         horizon: for "sdtw": H, to divide by H + 1 from the first step on.
 
     Raises:
-        ValueError: if there is no such reward, or the demonstration does not move and the reward
-            needs it to.
+        ValueError: if there is no such reward, a demonstration does not move and the reward needs
+            it to, or the retriever does not look at all frames that the reward needs.
     """
+    check_search(name, "exact" if retriever.memory.exact else "faiss")
     if name == "sdtw":
         return _Sdtw(retriever, horizon)
     if name in _STEPWISE:

@@ -24,6 +24,7 @@ What they are made of:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -279,11 +280,13 @@ def arc_length(embeddings: NDArray[np.float32]) -> NDArray[np.float64]:
     return phi
 
 
-def demonstration_tau(embeddings: NDArray[np.float32], gap: int = 5) -> float:
+def demonstration_tau(
+    embeddings: NDArray[np.float32] | Sequence[NDArray[np.float32]], gap: int = 5
+) -> float:
     """A demonstration's own scale: tau = sum d_i^2 / sum d_i with d_i = |y_i - y_{i+gap}|^2.
 
     Args:
-        embeddings: (N, D) float32, N >= 2.
+        embeddings: (N, D) float32, N >= 2; or several such, whose sums are taken together.
         gap: in frames; at most N - 1 is used.
 
     Returns:
@@ -292,11 +295,13 @@ def demonstration_tau(embeddings: NDArray[np.float32], gap: int = 5) -> float:
     Raises:
         ValueError: if frames that far apart never differ.
     """
-    gap = min(gap, len(embeddings) - 1)
+    parts = [embeddings] if isinstance(embeddings, np.ndarray) else embeddings
+    gap = min(gap, min(len(part) for part in parts) - 1)
     d = np.array(
         [
             squared_distances(y, later[None])[0]
-            for y, later in zip(embeddings[:-gap], embeddings[gap:], strict=True)
+            for part in parts
+            for y, later in zip(part[:-gap], part[gap:], strict=True)
         ]
     )
     if not d.sum() > 0:

@@ -11,7 +11,6 @@ Both put their alignment into ``info["retrieval"]``. Stacked, in either order, t
 from __future__ import annotations
 
 import math
-import os
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
@@ -21,12 +20,13 @@ from numpy.typing import NDArray
 
 from regil_wrappers.alignment import StepPattern
 from regil_wrappers.correction import Servo
-from regil_wrappers.demonstration import Demonstration
+from regil_wrappers.demonstrations import Demonstrations
 from regil_wrappers.encoders import Encoder
 from regil_wrappers.guide import Guide
-from regil_wrappers.guide_arguments import fitting_actions, make_servo
-from regil_wrappers.retrieval_wrapper import RetrievalWrapper, checked, label_of, settings_of
-from regil_wrappers.reward_signals import AT_EPISODE_END, AT_EVERY_STEP, make_signal
+from regil_wrappers.guide_arguments import check_guide, fitting_actions, make_servo
+from regil_wrappers.memory import Search
+from regil_wrappers.retrieval_wrapper import RetrievalWrapper, checked, settings_of
+from regil_wrappers.reward_signals import AT_EPISODE_END, AT_EVERY_STEP, check_search, make_signal
 from regil_wrappers.rewards import episode_scale
 
 __all__ = ["RetrievalGuideWrapper", "RetrievalRewardWrapper"]
@@ -36,8 +36,8 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
     """Says at each step which action the demonstrator took where the agent is now.
 
     It never changes an action: whoever chooses actions asks `guide_action()`. Observations and
-    rewards pass through. ``info["retrieval"]`` holds ``start``, ``end`` (frames of the
-    demonstration), ``cost`` and ``guide_action``.
+    rewards pass through. ``info["retrieval"]`` holds ``demonstration`` (which one of several),
+    ``start``, ``end`` (its frames), ``cost`` and ``guide_action``.
 
     With ``correction="servo"`` the suggested actions go where the target is now. The first episodes
     that follow the guide then begin with moves that show it how the camera sees the hand. From
@@ -61,7 +61,8 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
 
     Args:
         env: an environment with a Box action space.
-        demo: path of a demonstration; or a `Demonstration`, but such a stack has no ``spec``.
+        demo: path of a demonstration, a list of paths, or a folder of .hdf5 files; or
+            `Demonstration` objects, but such a stack has no ``spec``.
         encoder: name of an encoder (`regil_wrappers.encoder_names()`), or an object with
             ``encode(frames: uint8 (B, H, W, 3)) -> float32 (B, D)``, but such a stack has no
             ``spec``.
@@ -74,7 +75,7 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
             play on from that frame, one action a step; None: never.
         step_pattern: "symmetric" (Eq. 1) or "strap".
         register: whether pictures are moved back, once an episode has shown how far the target
-            stands from where it stood in the demonstration, before they are aligned.
+            stands from where it stood in the one demonstration, before they are aligned.
         correction: "none", or "servo": actions are corrected for where the target is
             (`regil_wrappers.correction`). Needs a fixed camera, an arm that starts in the same pose
             each time, and actions that are deltas.
@@ -85,7 +86,11 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         plane: how far targets move along these three, as standard deviations in action units.
         mirror: +1, or -1 where pictures are mirrored against the action axes, or "auto".
         disturbance: how far `disturbed_action` pushes the hand off the corrected path now and then,
-            in action units; needs a correction.
+            in action units; needs a correction, which needs to be of one demonstration.
+        search: how candidates are found among many demonstrations: "auto", "exact" or "faiss"
+            (`regil_wrappers.memory`).
+        deadline_ms: what a step's retrieval may take, in milliseconds: the first one that takes
+            longer is warned of, all are counted in ``retriever.latency.misses``.
 
     Raises:
         ValueError: if the demonstration does not fit the environment or an argument is out of
@@ -96,7 +101,7 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
     def __init__(
         self,
         env: gym.Env[ObsType, ActType],
-        demo: str | os.PathLike[str] | Demonstration,
+        demo: Demonstrations,
         encoder: str | Encoder = "pixels",
         k: int = 5,
         horizon: int = 4,
@@ -111,25 +116,15 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         plane: list[float] | None = None,
         mirror: Literal["auto", 1, -1] | None = None,
         disturbance: float = 0.0,
+        search: Search = "auto",
+        deadline_ms: float | None = None,
     ) -> None:
-        settings = settings_of(demo, encoder, k, horizon, image, step_pattern, register)
+        settings = settings_of(
+            demo, encoder, k, horizon, image, step_pattern, register, search, deadline_ms
+        )
         loaded, frames = checked(env, settings)
-        if type(guide_offset) is not int:
-            raise ValueError(f"guide_offset={guide_offset!r}: it must be a whole number of frames")
-        if guide_patience is not None and (type(guide_patience) is not int or guide_patience < 1):
-            raise ValueError(
-                f"guide_patience={guide_patience!r}: it must be at least 1 step, or None"
-            )
-        if correction not in ("none", "servo"):
-            raise ValueError(f"correction={correction!r}: choose one of ['none', 'servo']")
-        if not isinstance(disturbance, (int, float)) or not 0 <= disturbance < math.inf:
-            raise ValueError(f"disturbance={disturbance!r}: it must be a number of at least 0")
-        if disturbance > 0 and correction == "none":
-            raise ValueError(
-                f"disturbance={disturbance}: a guide without correction would not find its way "
-                "back, so set correction='servo' or disturbance=0"
-            )
-        actions = fitting_actions(env, loaded, label_of(settings["demo"]))
+        check_guide(guide_offset, guide_patience, correction, disturbance, len(loaded))
+        actions = fitting_actions(env.action_space, loaded, settings["demo"])
 
         gym.utils.RecordConstructorArgs.__init__(
             self,
@@ -156,8 +151,10 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
                 "plane": plane,
                 "mirror": mirror,
             }
+            said = env.unwrapped.metadata.get("regil") or {}
+            size = self.retriever.picture_size
             self._servo = make_servo(
-                env, self.retriever.picture_size, actions, declared, disturbance
+                said, env.action_space, size, actions[0], declared, disturbance
             )
         self._guide = Guide(actions, guide_offset, guide_patience, self._servo)
 
@@ -169,7 +166,6 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         Raises:
             ValueError: before the first reset.
         """
-        _ = self.alignment
         return self._guide.action()
 
     def disturbed_action(self) -> NDArray[np.float32]:
@@ -181,7 +177,6 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         Raises:
             ValueError: before the first reset.
         """
-        _ = self.alignment
         return self._guide.disturbed()
 
     def plain_action(self) -> NDArray[np.float32]:
@@ -192,7 +187,6 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         Raises:
             ValueError: before the first reset.
         """
-        _ = self.alignment
         return self._guide.plain()
 
     def reset(
@@ -261,8 +255,8 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
     ``regil_sb3.relabelling``'s replay buffers. Time limits belong inside this wrapper.
 
     Positive rewards pay for every step survived: where success ends the episode they teach not to
-    finish. Observations pass through. ``info["retrieval"]`` holds ``start``, ``end`` (frames of the
-    demonstration), ``cost`` and ``env_reward``, the environment's own.
+    finish. Observations pass through. ``info["retrieval"]`` holds ``demonstration`` (which one of
+    several), ``start``, ``end`` (its frames), ``cost`` and ``env_reward``, the environment's own.
 
     Example:
         >>> import gymnasium as gym
@@ -276,7 +270,8 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
 
     Args:
         env: the environment.
-        demo: path of a demonstration; or a `Demonstration`, but such a stack has no ``spec``.
+        demo: path of a demonstration, a list of paths, or a folder of .hdf5 files; or
+            `Demonstration` objects, but such a stack has no ``spec``.
         encoder: name of an encoder (`regil_wrappers.encoder_names()`), or an object with
             ``encode(frames: uint8 (B, H, W, 3)) -> float32 (B, D)``, but such a stack has no
             ``spec``.
@@ -291,7 +286,11 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
             as the paper does; they differ in the first H steps of an episode.
         step_pattern: "symmetric" (Eq. 1) or "strap".
         register: whether pictures are moved back, once an episode has shown how far the target
-            stands from where it stood in the demonstration, before they are aligned.
+            stands from where it stood in the one demonstration, before they are aligned.
+        search: how candidates are found among many demonstrations: "auto", "exact" or "faiss"
+            (`regil_wrappers.memory`).
+        deadline_ms: what a step's retrieval may take, in milliseconds: the first one that takes
+            longer is warned of, all are counted in ``retriever.latency.misses``.
 
     Raises:
         ValueError: if the demonstration does not fit the environment or an argument is out of
@@ -302,7 +301,7 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
     def __init__(
         self,
         env: gym.Env[ObsType, ActType],
-        demo: str | os.PathLike[str] | Demonstration,
+        demo: Demonstrations,
         encoder: str | Encoder = "pixels",
         k: int = 5,
         horizon: int = 4,
@@ -313,9 +312,14 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         divisor: Literal["window", "horizon"] = "window",
         step_pattern: StepPattern = "symmetric",
         register: bool = False,
+        search: Search = "auto",
+        deadline_ms: float | None = None,
     ) -> None:
-        settings = settings_of(demo, encoder, k, horizon, image, step_pattern, register)
+        settings = settings_of(
+            demo, encoder, k, horizon, image, step_pattern, register, search, deadline_ms
+        )
         loaded, frames = checked(env, settings)
+        check_search(reward, search)
         for name, value, choices in (
             ("reward", reward, (*AT_EVERY_STEP, *AT_EPISODE_END)),
             ("mode", mode, ("replace", "add")),

@@ -1,0 +1,121 @@
+"""Several demonstrations: against brute force, and against one alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from regil_wrappers import (
+    Demonstration,
+    RetrievalGuideWrapper,
+    RetrievalRewardWrapper,
+    Retriever,
+)
+from toy_env import ToyReach, record
+
+
+class Flat:
+    """A frame's own first pixels."""
+
+    def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return frames.reshape(len(frames), -1).astype(np.float32)
+
+
+def brute_force(
+    demos: list[NDArray[np.uint8]], seen: list[NDArray[np.uint8]], k: int
+) -> list[tuple[int, int, float]]:
+    """(demonstration, end, cost) that align the frames seen, the cheapest first."""
+    vectors = [d.reshape(len(d), -1).astype(float) for d in demos]
+    recent = [s.reshape(-1).astype(float) for s in seen]
+    away = [(((v - recent[-1]) ** 2).sum(axis=1)) for v in vectors]
+    flat = sorted(
+        (float(d), -f, -i) for i, one in enumerate(away) for f, d in enumerate(one)
+    )  # the nearest first
+    found = []
+    kth = flat[k - 1][0]
+    for i, v in enumerate(vectors):
+        candidates = [f for f, d in enumerate(away[i]) if d <= kth]
+        if not candidates:
+            continue
+        q = max(candidates)
+        cost = np.array([[((a - b) ** 2).sum() for b in v[: q + 1]] for a in recent])
+        table = cost.copy()
+        for r in range(1, len(table)):
+            for j in range(len(table[0])):
+                before = [table[r - 1, j]]
+                if j:
+                    before += [table[r - 1, j - 1], table[r, j - 1]]
+                table[r, j] += min(before)
+        end = int(np.flatnonzero(table[-1] == table[-1].min())[-1])
+        found.append((i, end, float(table[-1, end])))
+    return sorted(found, key=lambda one: one[2])
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_against_brute_force(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    frames = [rng.integers(0, 256, (n, 2, 2, 3), np.uint8) for n in rng.integers(6, 15, 4)]
+    retriever = Retriever([Demonstration(f) for f in frames], Flat(), k=5, horizon=3)
+    seen: list[NDArray[np.uint8]] = []
+    for _ in range(8):
+        seen = [*seen, rng.integers(0, 256, (2, 2, 3), np.uint8)][-4:]
+        got = retriever.step(seen[-1])
+        (demo, end, cost), *_ = brute_force(frames, seen, 5)
+        assert (got.demonstration, got.end) == (demo, end)
+        assert got.cost == pytest.approx(cost)
+
+
+def test_each_is_recognised(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 256, (12, 8, 8, 3), np.uint8) for _ in range(3)]
+    for i, f in enumerate(frames):
+        Demonstration(f).save(tmp_path / f"{i}.hdf5")
+    retriever = Retriever([Demonstration(f) for f in frames], Flat(), k=3, horizon=2)
+    for i, f in enumerate(frames):
+        retriever.reset()
+        for j, frame in enumerate(f):
+            got = retriever.step(frame)
+            assert (got.demonstration, got.end, got.cost) == (i, j, 0.0)
+
+
+def test_a_folder_guides_and_rewards(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        record(seed).save(tmp_path / f"{seed}.hdf5")
+    env = ToyReach()
+    guided = RetrievalGuideWrapper(env, str(tmp_path))
+    both = RetrievalRewardWrapper(guided, str(tmp_path))
+    _, info = both.reset(seed=0)
+    used, done = set(), False
+    while not done:
+        _, reward, terminated, truncated, info = both.step(guided.guide_action())
+        assert float(reward) <= 0
+        used.add(info["retrieval"]["demonstration"])
+        done = terminated or truncated
+    assert info["is_success"]
+    assert used <= {0, 1}
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"is a folder without \.hdf5 or \.h5 files"):
+        RetrievalRewardWrapper(ToyReach(), str(tmp_path))
+
+
+@pytest.mark.parametrize("deadline", [0, -1.0, True, float("nan")])
+def test_a_deadline_is_a_time(deadline: float) -> None:
+    demo = Demonstration(np.zeros((9, 8, 8, 3), np.uint8))
+    with pytest.raises(ValueError, match=r"deadline_ms=.*positive number of milliseconds"):
+        Retriever(demo, deadline_ms=deadline)
+
+
+def test_steps_that_come_too_late_are_counted_and_warned_of_once() -> None:
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (9, 16, 16, 3), np.uint8)
+    retriever = Retriever(Demonstration(frames), deadline_ms=1e-6)
+    with pytest.warns(UserWarning, match="later steps that do are only counted"):
+        retriever.step(frames[0])
+    for frame in frames[1:]:
+        retriever.step(frame)  # a second warning would be an error
+    assert (retriever.latency.steps, retriever.latency.misses) == (9, 9)
+    assert retriever.latency.percentiles()["total"]["p99"] > 0

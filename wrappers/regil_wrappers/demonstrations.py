@@ -1,0 +1,109 @@
+"""One demonstration or many, from files, folders or memory.
+
+* ``Demonstrations`` - what ``demo=`` takes
+* ``demonstrations`` - a sequence of what it names
+* ``label_of`` - what messages call one of them
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeAlias, overload
+
+from regil_wrappers.demonstration import Demonstration
+
+__all__ = ["Demonstrations", "as_given", "demonstrations", "label_of"]
+
+Demonstrations: TypeAlias = (
+    "str | os.PathLike[str] | Demonstration | Sequence[str | os.PathLike[str] | Demonstration]"
+)
+"""A file, a folder of them, a `Demonstration`, or a list of files or `Demonstration` objects."""
+
+_SUFFIXES = (".hdf5", ".h5")
+_KEPT_BYTES = 512 * 1024**2  # of pictures: files beyond that are read again when asked for
+
+
+class _Files(Sequence[Demonstration]):
+    """Demonstrations that are read when they are asked for."""
+
+    def __init__(self, given: Sequence[str | Demonstration]) -> None:
+        self._given = given
+        self._kept: dict[int, Demonstration] = {}
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._given)
+
+    @overload
+    def __getitem__(self, index: int) -> Demonstration: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Demonstration]: ...
+    def __getitem__(self, index: int | slice) -> Demonstration | Sequence[Demonstration]:
+        if isinstance(index, slice):
+            return _Files(self._given[index])
+        one = self._given[index]
+        if isinstance(one, Demonstration):
+            return one
+        if index in self._kept:
+            return self._kept[index]
+        demo = Demonstration.load(one)
+        size = demo.frames.nbytes + (
+            0 if demo.encoder_frames is None else demo.encoder_frames.nbytes
+        )
+        if self._bytes + size <= _KEPT_BYTES:
+            self._kept[index] = demo
+            self._bytes += size
+        return demo
+
+
+def as_given(demo: Demonstrations) -> str | Demonstration | list[str | Demonstration]:
+    """The same with paths as text, so that a specification can hold them.
+
+    Raises:
+        ValueError: if it is none of what ``demo=`` takes.
+    """
+    if isinstance(demo, Demonstration):
+        return demo
+    if isinstance(demo, (str, os.PathLike)):
+        return os.fspath(demo)
+    if not isinstance(demo, Sequence) or not demo:
+        raise ValueError(
+            f"demo={demo!r}: give a file, a folder of .hdf5 files, a Demonstration, or a list of "
+            "files or Demonstrations"
+        )
+    return [one if isinstance(one, Demonstration) else os.fspath(one) for one in demo]
+
+
+def demonstrations(
+    given: str | Demonstration | list[str | Demonstration],
+) -> Sequence[Demonstration]:
+    """What `as_given` named, in order; of a folder, the .hdf5 and .h5 files in it by name.
+
+    Files are read when they are first asked for.
+
+    Raises:
+        ValueError: if a folder holds no such file.
+    """
+    return _Files(_listed(given))
+
+
+def label_of(given: str | Demonstration | list[str | Demonstration], index: int = 0) -> str:
+    """What messages call a demonstration: its file, where it has one."""
+    listed = _listed(given)
+    one = listed[index]
+    if isinstance(one, str):
+        return f"demo {one!r}"
+    return "the demonstration" if len(listed) == 1 else f"demonstration {index}"
+
+
+def _listed(given: str | Demonstration | list[str | Demonstration]) -> list[str | Demonstration]:
+    if isinstance(given, list):
+        return given
+    if isinstance(given, str) and Path(given).is_dir():
+        files = sorted(str(f) for f in Path(given).iterdir() if f.suffix in _SUFFIXES)
+        if not files:
+            raise ValueError(f"demo {given!r} is a folder without .hdf5 or .h5 files")
+        return list(files)
+    return [given]
