@@ -23,13 +23,19 @@ class Collection:
         n_envs: environments.
         action_shape: (A,) of one action.
         guide_share: probability that the guide finishes an episode that the policy began.
+        keeps_own: whether episodes that are the policy's alone are kept too.
         latest: the guide takes over before this step: the demonstration's length.
     """
 
     def __init__(
-        self, n_envs: int, action_shape: tuple[int, ...], guide_share: float, latest: int
+        self,
+        n_envs: int,
+        action_shape: tuple[int, ...],
+        guide_share: float,
+        keeps_own: bool,
+        latest: int,
     ) -> None:
-        self._guide_share, self._latest = guide_share, latest
+        self._guide_share, self._keeps_own, self._latest = guide_share, keeps_own, latest
         self._labels = np.zeros((n_envs, *action_shape), np.float32)
         self.restart(False)
 
@@ -44,9 +50,10 @@ class Collection:
         self._steps: list[list[tuple[Any, npt.NDArray[Any]]]] = [[] for _ in range(n_envs)]
         self._returns = {name: np.zeros(n_envs) for name in _REWARDS}
         for env in range(n_envs):
-            self._begin(env, warmup)
+            self.begin(env, warmup)
 
-    def _begin(self, env: int, warmup: bool) -> None:
+    def begin(self, env: int, warmup: bool) -> None:
+        """The environment's next episode begins, in the warm-up or not."""
         self.warmup[env] = warmup
         shared = not warmup and self._guide_share > 0 and np.random.rand() < self._guide_share
         own = np.random.randint(self._latest) if shared else np.inf
@@ -85,13 +92,15 @@ class Collection:
         """
         retrieval = info.get("retrieval", {})
         self._demonstrates[env] = not retrieval.get("calibrating", False)
-        before = (
-            {k: v[env].copy() for k, v in seen.items()}
-            if isinstance(seen, dict)
-            else np.array(seen[env])
-        )
-        noted = self._labels[env] if self.labelled[env] else action
-        self._steps[env].append((before, noted.copy()))
+        labelled = self.labelled[env]
+        if labelled or self._keeps_own:
+            before = (
+                {k: v[env].copy() for k, v in seen.items()}
+                if isinstance(seen, dict)
+                else np.array(seen[env])
+            )
+            noted = self._labels[env] if labelled else action
+            self._steps[env].append((before, noted.copy()))
         late = np.sum(retrieval.get("episode_rewards", 0.0))
         self._returns["env_reward"][env] += retrieval.get("env_reward", reward)
         self._returns["retrieval_reward"][env] += reward + late
@@ -104,7 +113,7 @@ class Collection:
     def demonstration(self, env: int) -> tuple[Observations, npt.NDArray[np.float32]] | None:
         """What the environment's episode demonstrates: observations (T, ...), actions (T, A).
 
-        None where it did not succeed, or was calibrating.
+        None where it did not succeed, was calibrating, or is not kept.
         """
         if not (self.succeeded[env] and self._demonstrates[env] and self._steps[env]):
             return None
@@ -115,7 +124,3 @@ class Collection:
             else np.stack(seen)
         )
         return observations, np.stack(actions)
-
-    def end(self, env: int, warmup: bool) -> None:
-        """The environment's episode is over, and the next begins, in the warm-up or not."""
-        self._begin(env, warmup)

@@ -284,6 +284,7 @@ class TD3BC(TD3):
             self.n_envs,
             self.action_space.shape,
             self.guide_share,
+            self.keep_own_successes,
             len(self.demo) if self.demo is not None else 1,
         )
 
@@ -428,11 +429,10 @@ class TD3BC(TD3):
 
     def _end_episode(self, env: int) -> None:
         episodes = self._collection
-        own = not episodes.labelled[env]
-        if own:
+        if not episodes.labelled[env]:
             part = episodes.lengths[env] / max(self._total_timesteps - self.warmup_steps, 1)
             self._by_success.episode(bool(episodes.succeeded[env]), part)
-        shown = episodes.demonstration(env) if self.keep_own_successes or not own else None
+        shown = episodes.demonstration(env)
         if shown is not None and not self.success_buffer.add(*shown):
             warnings.warn(
                 f"a successful episode of {len(shown[1])} steps does not fit beside the "
@@ -443,7 +443,7 @@ class TD3BC(TD3):
         for name, value in episodes.returns(env).items():
             self._returns.setdefault(name, []).append(value)
             del self._returns[name][: -self._stats_window_size]
-        episodes.end(env, self.num_timesteps < self.warmup_steps)
+        episodes.begin(env, self.num_timesteps < self.warmup_steps)
 
     def _check_finite(self, reward: npt.NDArray[Any], new_obs: Any) -> None:
         values = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}
