@@ -227,11 +227,17 @@ def _target(env: gym.Env[Any, Any]) -> npt.NDArray[np.float64]:
 
 def _play(env: RetrievalGuideWrapper[Any, Any], seed: int) -> bool:
     env.reset(seed=seed)
-    over, info = False, {"is_success": False}
+    return _follow(env)[0]
+
+
+def _follow(env: RetrievalGuideWrapper[Any, Any]) -> tuple[bool, int]:
+    """Follow the guide to the episode's end: whether it succeeded, and agent steps."""
+    steps, over, info = 0, False, {"is_success": False}
     while not over:
         *_, terminated, truncated, info = env.step(env.guide_action())
         over = terminated or truncated
-    return bool(info["is_success"])
+        steps += 1
+    return bool(info["is_success"]), steps
 
 
 def _calibrate(env: RetrievalGuideWrapper[Any, Any], seed: int) -> int:
@@ -241,11 +247,7 @@ def _calibrate(env: RetrievalGuideWrapper[Any, Any], seed: int) -> int:
         env.reset(seed=seed + episode)
         if env.calibration() is not None:
             break
-        over = False
-        while not over:
-            *_, terminated, truncated, _ = env.step(env.guide_action())
-            over = terminated or truncated
-            steps += 1
+        steps += _follow(env)[1]
     return steps
 
 
