@@ -2,7 +2,7 @@
 
 * ``Demonstrations`` - what ``demo=`` takes
 * ``demonstrations`` - a sequence of what it names
-* ``label_of`` - what messages call one of them
+* ``labels_of`` - what messages call each of them
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TypeAlias, overload
 
 from regil_wrappers.demonstration import Demonstration
 
-__all__ = ["Demonstrations", "as_given", "demonstrations", "label_of"]
+__all__ = ["Demonstrations", "as_given", "demonstrations", "labels_of"]
 
 Demonstrations: TypeAlias = (
     "str | os.PathLike[str] | Demonstration | Sequence[str | os.PathLike[str] | Demonstration]"
@@ -89,13 +89,15 @@ def demonstrations(
     return _Files(_listed(given))
 
 
-def label_of(given: str | Demonstration | list[str | Demonstration], index: int = 0) -> str:
-    """What messages call a demonstration: its file, where it has one."""
+def labels_of(given: str | Demonstration | list[str | Demonstration]) -> list[str]:
+    """What messages call each demonstration: its file, where it has one."""
     listed = _listed(given)
-    one = listed[index]
-    if isinstance(one, str):
-        return f"demo {one!r}"
-    return "the demonstration" if len(listed) == 1 else f"demonstration {index}"
+    if len(listed) == 1 and isinstance(listed[0], Demonstration):
+        return ["the demonstration"]
+    return [
+        f"demo {one!r}" if isinstance(one, str) else f"demonstration {i}"
+        for i, one in enumerate(listed)
+    ]
 
 
 def _listed(given: str | Demonstration | list[str | Demonstration]) -> list[str | Demonstration]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from regil_wrappers.correction import Servo
 from regil_wrappers.demonstration import Demonstration
-from regil_wrappers.demonstrations import label_of
+from regil_wrappers.demonstrations import labels_of
 
 __all__ = ["check_guide", "fitting_actions", "make_servo"]
 
@@ -60,7 +60,7 @@ def fitting_actions(
         demos: the demonstrations.
         given: what ``demo=`` was, for messages.
     """
-    return [_fitting(space, demos[i], label_of(given, i)) for i in range(len(demos))]
+    return [_fitting(space, *one) for one in zip(demos, labels_of(given), strict=True)]
 
 
 def _fitting(space: gym.Space[Any], demo: Demonstration, label: str) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from regil_wrappers.demonstration import Demonstration
-from regil_wrappers.demonstrations import Demonstrations, as_given, demonstrations, label_of
+from regil_wrappers.demonstrations import Demonstrations, as_given, demonstrations, labels_of
 from regil_wrappers.encoders import Encoder, make_encoder
 from regil_wrappers.episode import Episode
 from regil_wrappers.frames import FrameSource, check_recorded_settings
@@ -172,7 +172,7 @@ def checked(
         return env.get_wrapper_attr("demonstrations"), None
     demos = demonstrations(settings["demo"])
     check_demonstrations(env, demos, settings)
-    return demos, FrameSource(env, demos[0], label_of(settings["demo"]), settings["image"])
+    return demos, FrameSource(env, demos[0], labels_of(settings["demo"])[0], settings["image"])
 
 
 def check_shared(settings: dict[str, Any], inside: dict[str, Any]) -> None:
@@ -210,12 +210,11 @@ def check_demonstrations(
     if not isinstance(encoder, str) and not hasattr(encoder, "encode"):
         raise ValueError(f"encoder={encoder!r}: give a name, or an object with encode(frames)")
     Latency(settings["deadline_ms"])
-    lengths, labels = [], []
-    for i in range(len(demos)):
-        demo = demos[i]
-        labels.append(label_of(settings["demo"], i))
+    labels = labels_of(settings["demo"])
+    lengths = []
+    for demo, label in zip(demos, labels, strict=True):
         lengths.append(len(demo))
-        check_recorded_settings(env, demo, labels[-1])
+        check_recorded_settings(env, demo, label)
     check_settings(
         lengths,
         settings["k"],
