@@ -13,6 +13,8 @@ from regil_wrappers import (
     RetrievalRewardWrapper,
     Retriever,
 )
+from regil_wrappers.latency import Latency
+from regil_wrappers.retrieval import step_together
 from toy_env import ToyReach, record
 
 
@@ -119,3 +121,20 @@ def test_steps_that_come_too_late_are_counted_and_warned_of_once() -> None:
         retriever.step(frame)  # a second warning would be an error
     assert (retriever.latency.steps, retriever.latency.misses) == (9, 9)
     assert retriever.latency.percentiles()["total"]["p99"] > 0
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_episodes_stepped_together_align_as_each_alone(count: int) -> None:
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 256, (12, 8, 8, 3), np.uint8) for _ in range(count)]
+    alone = Retriever([Demonstration(f) for f in frames], k=4, horizon=2)
+    together = [alone, alone.another(), alone.another()]
+    single = [alone.another() for _ in together]
+    latency = Latency()
+    for _ in range(6):
+        seen = list(rng.integers(0, 256, (3, 8, 8, 3), np.uint8))
+        step_together(together, seen, latency)
+        for a, b, frame in zip(together, single, seen, strict=True):
+            assert a.alignment == b.step(frame)
+            np.testing.assert_array_equal(a.distances, b.distances)
+    assert latency.steps == 6

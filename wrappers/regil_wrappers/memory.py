@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from regil_wrappers.alignment import squared_distances
 from regil_wrappers.demonstration import Demonstration
-from regil_wrappers.encoders import Encoder, embed
+from regil_wrappers.encoders import Encoder, embed, fitted
 from regil_wrappers.limits import need
 
 __all__ = ["SEARCHES", "Memory", "Search"]
@@ -30,7 +30,7 @@ Search = Literal["auto", "exact", "faiss"]
 SEARCHES = ("auto", "exact", "faiss")
 
 EXACT_FRAMES = 20_000
-"""Up to so many frames "auto" searches exactly (`regil bench memory`)."""
+"""Up to so many frames "auto" searches exactly."""
 _PROBED = 16  # cells that a search looks into, of sqrt(frames)
 _TRAINED = 64  # frames that a cell's centre is found from
 
@@ -40,7 +40,8 @@ class Memory:
 
     Args:
         demos: the demonstrations.
-        encoder: turns their frames into embeddings, one at a time.
+        encoder: turns their frames into embeddings, one at a time; whitening is fitted on the
+            first demonstration.
         use_encoder_frames: whether memory is ``encoder_frames`` instead of ``frames``.
         search: "exact" compares with every frame. "faiss" looks into the 16 of sqrt(frames) cells
             of a `Faiss <https://faiss.ai>`_ inverted file whose centres are nearest, and may miss a
@@ -48,6 +49,7 @@ class Memory:
             together.
 
     Attributes:
+        encoder: as given, or its whitening fitted.
         embeddings: (N, D) float32, of all frames, not to be written to.
         parts: of each demonstration, (N_d, D) float32, views of the same.
         starts: (demonstrations + 1,) int: the number of each one's first frame, and N.
@@ -67,20 +69,20 @@ class Memory:
         search: Search = "auto",
     ) -> None:
         parts = []
-        for i in range(len(demos)):
-            demo = demos[i]
+        for i, demo in enumerate(demos):
             frames = demo.encoder_frames if use_encoder_frames else demo.frames
             which = "the demonstration" if len(demos) == 1 else f"demonstration {i}"
             if frames is None:
                 raise ValueError(f"use_encoder_frames: {which} has no encoder_frames")
             if i == 0:
                 self.frame_shape = frames.shape[1:]
+                self.encoder = fitted(encoder, frames)
             elif frames.shape[1:] != self.frame_shape:
                 raise ValueError(
                     f"{which} has frames {frames.shape[1:]} but the first one {self.frame_shape}: "
                     "give demonstrations of one size"
                 )
-            parts.append(embed(encoder, frames))
+            parts.append(embed(self.encoder, frames))
         self.starts = np.concatenate([[0], np.cumsum([len(part) for part in parts])])
         self.embeddings = parts[0] if len(parts) == 1 else np.concatenate(parts)
         self.embeddings.flags.writeable = False

@@ -23,7 +23,7 @@ from regil_wrappers.alignment import (
     warping_path,
 )
 from regil_wrappers.demonstration import Demonstration
-from regil_wrappers.encoders import Encoder, check_embedding, fitted, make_encoder
+from regil_wrappers.encoders import Encoder, check_embedding, make_encoder
 from regil_wrappers.latency import Latency
 from regil_wrappers.memory import SEARCHES, Memory, Search
 from regil_wrappers.window import make_window
@@ -117,15 +117,11 @@ class Retriever:
         check_settings([len(one) for one in demos], k, horizon, step_pattern, labels, search)
         self.latency = Latency(deadline_ms)
         encoder = make_encoder(encoder) if isinstance(encoder, str) else encoder
-        # Whitening is fitted to one demonstration: the first of several
-        first = demos[0].encoder_frames if use_encoder_frames else demos[0].frames
-        if first is None:
-            raise ValueError("use_encoder_frames: the demonstration has no encoder_frames")
-        self.encoder = fitted(encoder, first)
         self.k = k
         self.horizon = horizon
         self.step_pattern: StepPattern = step_pattern
-        self.memory = Memory(demos, self.encoder, use_encoder_frames, search)
+        self.memory = Memory(demos, encoder, use_encoder_frames, search)
+        self.encoder = self.memory.encoder
         self._begin()
 
     def _begin(self) -> None:

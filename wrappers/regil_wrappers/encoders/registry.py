@@ -110,7 +110,7 @@ def make_encoder(name: str, **options: Hashable) -> Encoder:
             FILE a checkpoint with its weights. ``"<module>:<function>"`` runs code: such a name
             must be the user's own, never something read from a file of someone else's.
         options: the same as keywords; they win. Each encoder takes ``whiten``, the rest depends on
-            it (docs/encoders.md).
+            it: its factory's keywords.
 
     Raises:
         ValueError: if there is no encoder of that name, it has no such option, or its weights

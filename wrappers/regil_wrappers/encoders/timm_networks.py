@@ -87,7 +87,7 @@ class TimmEncoder(NetworkEncoder):
         one_of("features", features, FEATURES)
         one_of("projection", projection, (True, False))
         Preprocessing(size, crop)
-        timm, _ = _import_timm()
+        timm = _import_timm()
         check_execution(device, precision, compile, batch)
         if not timm.is_model(model):
             close = timm.list_models(f"*{model.split('.')[0].split('_')[0]}*", pretrained=True)[:5]
@@ -153,7 +153,7 @@ def efficientnet_lite0(
     one_of("features", features, FEATURES)
     mean, std = (127 / 255,) * 3, (128 / 255,) * 3
     preprocessing = Preprocessing(size, crop, mean, std)
-    timm, _ = _import_timm()
+    timm = _import_timm()
     check_execution(**execution)
     path = find_weights("efficientnet-lite0.pth", file)
     if path is None:
@@ -195,7 +195,7 @@ def r3m(
     """
     one_of("features", features, FEATURES)
     preprocessing = Preprocessing(size, crop, _IMAGENET_MEAN, _IMAGENET_STD)
-    timm, _ = _import_timm()
+    timm = _import_timm()
     check_execution(**execution)
     name = f"r3m-{model}"
     path = find_weights(f"{name}.pt", file)
@@ -269,11 +269,11 @@ def _without(tokens: Any, prefix: int) -> Any:
     return tokens[:, prefix:] if tokens.ndim == 3 else tokens
 
 
-def _import_timm() -> tuple[Any, Any]:
+def _import_timm() -> Any:
     torch = import_torch()
     try:
         try:
-            return import_module("timm"), torch
+            return import_module("timm")
         except RuntimeError as error:
             # A torchvision built for another torch has no compiled operators. timm only imports it.
             if "torchvision::nms" not in str(error):
@@ -282,7 +282,7 @@ def _import_timm() -> tuple[Any, Any]:
         for name in ("nms", "qnms"):
             library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
         _libraries.append(library)  # the operators vanish with the object
-        return import_module("timm"), torch
+        return import_module("timm")
     except ImportError as error:
         raise ImportError(
             f"this encoder needs torch and timm ({error}): pip install 'regil-wrappers[timm]'"
