@@ -9,7 +9,7 @@ import pytest
 from regil_wrappers import Demonstration
 
 
-@pytest.mark.parametrize("name", ["demonstration", "retrieval", "wrappers"])
+@pytest.mark.parametrize("name", ["demonstration", "retrieval", "wrappers", "vector"])
 def test_examples(name: str, demo: Demonstration) -> None:
     module = importlib.import_module(f"regil_wrappers.{name}")
     failed, tried = doctest.testmod(module, extraglobs={"toy_demo": demo})

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from typing import Any
 
@@ -21,7 +22,7 @@ __all__ = ["Episode"]
 class Episode:
     """Gives a retriever the pictures of one environment, one episode after the other.
 
-    Call `begin` where an episode begins, then `picture` for each observation.
+    Call `begin` where an episode begins, then `picture` for each frame.
 
     Args:
         retriever: what the pictures are for.
@@ -44,9 +45,16 @@ class Episode:
         self._registered = False
         self._displacement: Displacement | None = None
 
-    def picture(self, observation: Any) -> NDArray[np.uint8]:
-        """The picture to align for this observation, (H, W, 3) uint8."""
-        self._last = seen = self.frames.current(observation)
+    def another(self) -> Episode:
+        """The next one of the same environment, begun, with a retriever of its own."""
+        twin = copy.copy(self)
+        twin.retriever = self.retriever.another()
+        twin.begin()
+        return twin
+
+    def picture(self, raw: Any) -> NDArray[np.uint8]:
+        """The picture to align, (H, W, 3) uint8, from what `FrameSource.raw` gave."""
+        self._last = seen = self.frames.picture(raw)
         if self._first is None:
             self._first = seen.copy()
         return moved_back(seen, self.displacement) if self._moves_back else seen

@@ -1,13 +1,15 @@
 """Where an environment's pictures come from, and whether a demonstration's compare with them.
 
 * ``FrameSource`` - takes the picture out of an observation, a render or a larger frame
+* ``Asked`` - what is asked for it: an environment, or several at once
 * ``check_recorded_settings`` - camera, render settings and action repeat are those of the recording
 * ``check_size``, ``check_upright`` - two first frames have one size and are the same way up
 """
 
 from __future__ import annotations
 
-from typing import Any, cast
+import copy
+from typing import Any, Protocol, cast
 
 import cv2
 import gymnasium as gym
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 
 from regil_wrappers.demonstration import Demonstration
 
-__all__ = ["FrameSource", "check_recorded_settings", "check_size", "check_upright"]
+__all__ = ["Asked", "FrameSource", "check_recorded_settings", "check_size", "check_upright"]
 
 # What decides how frames look and follow each other, where an environment states it.
 _AS_RECORDED = ("camera", "render", "action_repeat")
@@ -30,20 +32,62 @@ _TURNED = 0.25
 _SWAPPED = 0.05
 
 
+class Asked(Protocol):
+    """A `gymnasium.Env`; or several of them, which answer `render` and methods with sequences."""
+
+    @property
+    def observation_space(self) -> gym.Space[Any]:
+        """Of one environment."""
+        ...
+
+    @property
+    def render_mode(self) -> str | None:
+        """How `render` draws."""
+        ...
+
+    @property
+    def unwrapped(self) -> Any:
+        """What has the ``metadata``."""
+        ...
+
+    def render(self) -> Any:
+        """The picture, or that of each."""
+        ...
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Whether it, or each of them, has this attribute."""
+        ...
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """The attribute; of several a function that calls each one's."""
+        ...
+
+
 class FrameSource:
     """Takes the current picture of an environment, the way the demonstration's was taken.
 
+    Of several environments it takes the pictures together: `another` for each one checks them.
+
     Args:
-        env: the environment.
+        env: the environment, or several.
         demo: the demonstration that pictures will be compared with.
         label: what errors call it.
         image: "obs", "obs:KEY" or "render".
+        resets_at_once: whether the environment begins its next episode in the step that ends one,
+            so that only an observation can show an episode's last picture.
 
     Raises:
         ValueError: if there is no such picture, or it has another size than the demonstration's.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], demo: Demonstration, label: str, image: str) -> None:
+    def __init__(
+        self,
+        env: Asked,
+        demo: Demonstration,
+        label: str,
+        image: str,
+        resets_at_once: bool = False,
+    ) -> None:
         self._env = env
         self._demo = demo
         self._label = label
@@ -52,7 +96,9 @@ class FrameSource:
         self._channels_first = False
         self._first_is_checked = False
         self._encoder_size: int | None = None
+        self._resets_at_once = resets_at_once
         if self._render:
+            self._check_last("image='render'")
             if env.render_mode != "rgb_array":
                 raise ValueError(
                     f"image='render' needs render_mode='rgb_array', but the environment was made "
@@ -96,33 +142,58 @@ class FrameSource:
         larger = self._demo.encoder_frames
         if larger is None or not self._env.has_wrapper_attr("encoder_frame"):
             return False
+        self._check_last(f"{self._label} holds {larger.shape[1]}-pixel encoder_frames")
         self._encoder_size = larger.shape[1]
         return True
 
+    def _check_last(self, why: str) -> None:
+        if self._resets_at_once:
+            raise ValueError(
+                f"{why}, but these environments begin the next episode before the last picture of "
+                "one can be asked for: put the picture into observations "
+                "(gymnasium.wrappers.AddRenderObservation) and use image='obs' or 'obs:KEY'"
+            )
+
+    def another(self) -> FrameSource:
+        """One more that has compared no picture yet, for an environment beside this one."""
+        twin = copy.copy(self)
+        twin._first_is_checked = False
+        return twin
+
     @property
     def recorded_first(self) -> NDArray[np.uint8]:
-        """The demonstration's first picture of the kind that `current` gives, (H, W, 3) uint8."""
+        """The demonstration's first picture of the kind that `picture` gives, (H, W, 3) uint8."""
         if self._encoder_size is not None:
             frames = cast("NDArray[np.uint8]", self._demo.encoder_frames)
         else:
             frames = self._demo.frames
         return cast("NDArray[np.uint8]", frames[0])
 
-    def current(self, observation: Any) -> NDArray[np.uint8]:
-        """The current picture, (H, W, 3) uint8; the very first one is compared with the recording.
+    def raw(self, observation: Any) -> Any:
+        """What the current picture is made of, as the environment gives it.
 
         Args:
             observation: the environment's last observation.
 
+        Returns:
+            of several environments, a sequence.
+        """
+        if self._encoder_size is not None:
+            return self._env.get_wrapper_attr("encoder_frame")(self._encoder_size)
+        if self._render:
+            return self._env.render()
+        return observation if self._key is None else observation[self._key]
+
+    def picture(self, raw: Any) -> NDArray[np.uint8]:
+        """The picture, (H, W, 3) uint8; the very first one is compared with the recording.
+
+        Args:
+            raw: what `raw` gave, of one environment.
+
         Raises:
             ValueError: if the first picture has another size or is not the same way up.
         """
-        if self._encoder_size is not None:
-            frame = self._env.get_wrapper_attr("encoder_frame")(self._encoder_size)
-        else:
-            frame = self._env.render() if self._render else observation
-        if self._key is not None:
-            frame = frame[self._key]
+        frame = raw
         if self._channels_first:
             frame = np.moveaxis(frame, 0, -1)
         if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3:
@@ -145,7 +216,7 @@ def _is_picture(space: gym.Space[Any]) -> bool:
     )
 
 
-def check_recorded_settings(env: gym.Env[Any, Any], demo: Demonstration, label: str) -> None:
+def check_recorded_settings(env: Asked, demo: Demonstration, label: str) -> None:
     """Refuse a camera, render settings or action repeat other than the recording's.
 
     Environments that do not state theirs (``metadata["regil"]``) pass.

@@ -132,6 +132,33 @@ class Guide:
         action: NDArray[np.float32] = actions[min(max(frame, 0), len(actions) - 1)].copy()
         return action
 
+    @property
+    def target_shift(self) -> NDArray[np.float64] | None:
+        """(3,) action units: where this episode's target is believed to have gone; None: unknown.
+
+        Unknown without a correction, while it calibrates, and where it replays plainly.
+        """
+        if self.servo is None or self.servo.kind not in ("corrected", "released"):
+            return None
+        return self.servo.target_shift
+
+    def calibration(self) -> dict[str, Any] | None:
+        """What a correction has learned about camera and task, as JSON values.
+
+        None before its calibration is over, and without a correction.
+        """
+        return None if self.servo is None else self.servo.state()
+
+    def set_calibration(self, calibration: dict[str, Any]) -> None:
+        """Take over another guide's calibration: same demonstration, same camera.
+
+        Raises:
+            ValueError: if it is not one, or from pictures of another size.
+        """
+        if self.servo is None:
+            raise ValueError("a guide without correction takes no calibration")
+        self.servo.load_state(calibration)
+
     def said(self) -> dict[str, Any]:
         """What ``info["retrieval"]`` holds of it."""
         said: dict[str, Any] = {"guide_action": self.action()}

@@ -15,7 +15,7 @@ from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.demonstrations import Demonstrations, as_given, demonstrations, labels_of
 from regil_wrappers.encoders import Encoder, make_encoder
 from regil_wrappers.episode import Episode
-from regil_wrappers.frames import FrameSource, check_recorded_settings
+from regil_wrappers.frames import Asked, FrameSource, check_recorded_settings
 from regil_wrappers.latency import Latency
 from regil_wrappers.registration import Displacement
 from regil_wrappers.retrieval import Alignment, Retriever, check_settings
@@ -75,14 +75,14 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         observation, info = self.env.reset(seed=seed, options=options)
         if self._frames is not None:
             self._episode.begin()
-            self.retriever.step(self._episode.picture(observation))
+            self.retriever.step(self._episode.picture(self._frames.raw(observation)))
         return observation, info
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the environment and align the frame that follows."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         if self._frames is not None:
-            self.retriever.step(self._episode.picture(observation))
+            self.retriever.step(self._episode.picture(self._frames.raw(observation)))
         return observation, reward, terminated, truncated, info
 
     @property
@@ -167,6 +167,11 @@ def checked(
         the demonstrations, and where frames come from: None if a retrieval wrapper further in takes
         them.
     """
+    if not isinstance(env, gym.Env):
+        raise ValueError(
+            f"{env!r} is no gymnasium.Env: regil_wrappers.vector has the same wrappers for vector "
+            "environments"
+        )
     if env.has_wrapper_attr("retrieval_settings"):
         check_shared(settings, env.get_wrapper_attr("retrieval_settings"))
         return env.get_wrapper_attr("demonstrations"), None
@@ -192,7 +197,7 @@ def check_shared(settings: dict[str, Any], inside: dict[str, Any]) -> None:
 
 
 def check_demonstrations(
-    env: gym.Env[Any, Any], demos: Sequence[Demonstration], settings: dict[str, Any]
+    env: Asked, demos: Sequence[Demonstration], settings: dict[str, Any]
 ) -> None:
     """Refuse settings, and demonstrations that do not fit them or were recorded otherwise.
 

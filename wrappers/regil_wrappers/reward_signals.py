@@ -3,11 +3,14 @@
 * ``Signal`` - rewards one episode after the other, from what a `Retriever` has seen
 * ``make_signal`` - one by name
 * ``check_search`` - whether it can be had with a way of searching
+* ``check_reward`` - what else decides it
 * ``AT_EVERY_STEP``, ``AT_EPISODE_END`` - the names
 """
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Callable
 from functools import cached_property
 
@@ -18,7 +21,14 @@ from regil_wrappers import rewards
 from regil_wrappers.alignment import squared_distances
 from regil_wrappers.retrieval import Retriever
 
-__all__ = ["AT_EPISODE_END", "AT_EVERY_STEP", "Signal", "check_search", "make_signal"]
+__all__ = [
+    "AT_EPISODE_END",
+    "AT_EVERY_STEP",
+    "Signal",
+    "check_reward",
+    "check_search",
+    "make_signal",
+]
 
 
 class Signal:
@@ -34,6 +44,12 @@ class Signal:
 
     def __init__(self, retriever: Retriever) -> None:
         self.retriever = retriever
+
+    def another(self, retriever: Retriever) -> Signal:
+        """The same for the frames of another retriever, `Retriever.another` of this one's."""
+        twin = copy.copy(self)
+        twin.retriever = retriever
+        return twin
 
     @property
     def scale(self) -> float:
@@ -186,6 +202,24 @@ def check_search(name: str, search: str) -> None:
             f"reward={name!r} compares with every frame of every demonstration and search='faiss' "
             "does not: set search='exact', or choose 'sdtw', 'progress' or 'cos'"
         )
+
+
+def check_reward(reward: str, mode: str, weight: float, divisor: str, search: str) -> None:
+    """Refuse values that mean nothing, before any long work.
+
+    Raises:
+        ValueError: naming the argument, its value and what would be right.
+    """
+    check_search(reward, search)
+    for name, value, choices in (
+        ("reward", reward, (*AT_EVERY_STEP, *AT_EPISODE_END)),
+        ("mode", mode, ("replace", "add")),
+        ("divisor", divisor, ("window", "horizon")),
+    ):
+        if value not in choices:
+            raise ValueError(f"{name}={value!r}: choose one of {list(choices)}")
+    if not isinstance(weight, (int, float)) or not math.isfinite(weight):
+        raise ValueError(f"weight={weight!r}: it must be a finite number")
 
 
 def make_signal(name: str, retriever: Retriever, horizon: int | None = None) -> Signal:

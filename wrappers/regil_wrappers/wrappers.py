@@ -10,7 +10,6 @@ Both put their alignment into ``info["retrieval"]``. Stacked, in either order, t
 
 from __future__ import annotations
 
-import math
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
@@ -26,7 +25,7 @@ from regil_wrappers.guide import Guide
 from regil_wrappers.guide_arguments import check_guide, fitting_actions, make_servo
 from regil_wrappers.memory import Search
 from regil_wrappers.retrieval_wrapper import RetrievalWrapper, checked, settings_of
-from regil_wrappers.reward_signals import AT_EPISODE_END, AT_EVERY_STEP, check_search, make_signal
+from regil_wrappers.reward_signals import AT_EPISODE_END, check_reward, make_signal
 from regil_wrappers.rewards import episode_scale
 
 __all__ = ["RetrievalGuideWrapper", "RetrievalRewardWrapper"]
@@ -96,6 +95,8 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         ValueError: if the demonstration does not fit the environment or an argument is out of
             range; at the first reset, if the picture is upside down, mirrored or has its colours
             swapped.
+
+    The vector twin: `regil_wrappers.vector.RetrievalGuideWrapper`.
     """
 
     def __init__(
@@ -213,16 +214,14 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
 
         Unknown without a correction, while it calibrates, and where it replays plainly.
         """
-        if self._servo is None or self._servo.kind not in ("corrected", "released"):
-            return None
-        return self._servo.target_shift
+        return self._guide.target_shift
 
     def calibration(self) -> dict[str, Any] | None:
         """What a correcting guide has learned about camera and task, as JSON values.
 
         None before its calibration is over, and without a correction.
         """
-        return None if self._servo is None else self._servo.state()
+        return self._guide.calibration()
 
     def set_calibration(self, calibration: dict[str, Any]) -> None:
         """Take over another guide's calibration: same demonstration, same camera.
@@ -230,9 +229,7 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         Raises:
             ValueError: if it is not one, or from pictures of another size.
         """
-        if self._servo is None:
-            raise ValueError("a guide without correction takes no calibration")
-        self._servo.load_state(calibration)
+        self._guide.set_calibration(calibration)
 
 
 class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
@@ -296,6 +293,8 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         ValueError: if the demonstration does not fit the environment or an argument is out of
             range; at the first reset, if the picture is upside down, mirrored or has its colours
             swapped.
+
+    The vector twin: `regil_wrappers.vector.RetrievalRewardWrapper`.
     """
 
     def __init__(
@@ -319,16 +318,7 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
             demo, encoder, k, horizon, image, step_pattern, register, search, deadline_ms
         )
         loaded, frames = checked(env, settings)
-        check_search(reward, search)
-        for name, value, choices in (
-            ("reward", reward, (*AT_EVERY_STEP, *AT_EPISODE_END)),
-            ("mode", mode, ("replace", "add")),
-            ("divisor", divisor, ("window", "horizon")),
-        ):
-            if value not in choices:
-                raise ValueError(f"{name}={value!r}: choose one of {list(choices)}")
-        if not isinstance(weight, (int, float)) or not math.isfinite(weight):
-            raise ValueError(f"weight={weight!r}: it must be a finite number")
+        check_reward(reward, mode, weight, divisor, search)
 
         gym.utils.RecordConstructorArgs.__init__(
             self,
