@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -97,6 +100,43 @@ def test_a_folder_guides_and_rewards(tmp_path: Path) -> None:
         done = terminated or truncated
     assert info["is_success"]
     assert used <= {0, 1}
+
+
+@pytest.mark.parametrize(("encoder", "reads"), [("pixels", 1), ("pixels?whiten=2", 2)])
+def test_files_are_read_one_after_the_other_and_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoder: str, reads: int
+) -> None:
+    for seed in range(4):
+        record(seed).save(tmp_path / f"{seed}.hdf5")
+    read, there = [], weakref.WeakSet[Demonstration]()
+    load = Demonstration.load
+
+    def spied(path: str) -> Demonstration:
+        read.append(Path(path).stem)
+        demo = load(path)
+        there.add(demo)
+        assert len(there) <= 3  # the first, the one before and this
+        return demo
+
+    monkeypatch.setattr(Demonstration, "load", spied)
+    guided = RetrievalGuideWrapper(ToyReach(), str(tmp_path), encoder)
+    both = RetrievalRewardWrapper(guided, str(tmp_path), encoder)
+    both.reset(seed=0)
+    assert read == ["0"] + reads * ["1", "2", "3"]
+    gc.collect()
+    assert len(there) == 1
+
+
+def test_a_file_that_claims_too_much_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    for seed in range(2):
+        record(seed).save(tmp_path / f"{seed}.hdf5")
+    with h5py.File(tmp_path / "1.hdf5", "a") as file:
+        obs = file["data/demo_0/obs"]
+        shape = (10**12, *obs["agentview_image"].shape[1:])
+        del obs["agentview_image"]
+        obs.create_dataset("agentview_image", shape, np.uint8, chunks=(1, *shape[1:]))
+    with pytest.raises(ValueError, match=r"1\.hdf5.*claims \d+ bytes"):
+        RetrievalRewardWrapper(ToyReach(), str(tmp_path))
 
 
 def test_an_empty_folder_is_refused(tmp_path: Path) -> None:

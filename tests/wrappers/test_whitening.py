@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from regil_wrappers import Demonstration, Retriever, make_encoder, register_encoder
-from regil_wrappers.encoders import cache, embed, fitted
+from regil_wrappers.encoders import cache, embed, fitted, whitening
 from regil_wrappers.encoders.pca import principal_axes
 
 pytestmark = pytest.mark.usefixtures("fresh_encoders")
@@ -37,7 +37,9 @@ def test_whitened_features_have_unit_covariance(rows: int, columns: int, seed: i
 
 
 def test_too_many_axes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"12 frames span 11 directions.*choose whiten=11 or less"):
+    with pytest.raises(
+        ValueError, match=r"12 frames it is fitted on span 11 direc.*choose whiten=11 or"
+    ):
         fitted(make_encoder("pixels?whiten=12"), FRAMES)
     fitted(make_encoder("pixels?whiten=11"), FRAMES)
     still = np.repeat(FRAMES[:1], 12, axis=0)
@@ -69,9 +71,24 @@ def test_a_batch_gives_the_same_bits() -> None:
 
 
 def test_several_demonstrations_are_fitted_together() -> None:
-    encoder = fitted(make_encoder("pixels?whiten=4"), FRAMES, OTHER)
+    encoder = fitted(make_encoder("pixels?whiten=4"), iter([FRAMES, OTHER]))
     both = encoder.encode(np.concatenate([FRAMES, OTHER]))
     np.testing.assert_allclose(np.cov(both.T), np.eye(4), atol=1e-3)
+    retriever = Retriever([Demonstration(FRAMES), Demonstration(OTHER)], "pixels?whiten=4")
+    np.testing.assert_array_equal(retriever.embeddings, both)
+
+
+@pytest.mark.parametrize("rows", [3, 7, 24])
+def test_of_many_frames_evenly_spaced_ones_are_fitted_on(
+    rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(whitening, "_FITTED_BYTES", rows * 28 * 28 * 3 * 4)
+    step = {3: 8, 7: 4, 24: 1}[rows]
+    parts = [FRAMES[:5], FRAMES[5:6], FRAMES[6:], OTHER]
+    some = fitted(make_encoder("pixels?whiten=2"), parts)
+    monkeypatch.undo()
+    expected = fitted(make_encoder("pixels?whiten=2"), np.concatenate([FRAMES, OTHER])[::step])
+    np.testing.assert_array_equal(some.encode(OTHER), expected.encode(OTHER))
 
 
 def test_others_are_left_as_they_are() -> None:

@@ -35,6 +35,8 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,31 +46,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regil_wrappers import hdf5
+from regil_wrappers.content import (
+    FORMAT_VERSION,
+    check_actions,
+    check_metadata,
+    check_pictures,
+    check_rows,
+)
 from regil_wrappers.limits import Budget
 
-__all__ = ["FORMAT_VERSION", "Demonstration"]
-
-FORMAT_VERSION = 1
+__all__ = ["FORMAT_VERSION", "Demonstration", "Outline"]
 
 _FRAMES = "agentview_image"
 _ENCODER_FRAMES = "encoder_image"
 _OBSERVATION = "observation"
 
-_METADATA_DEFAULTS: dict[str, Any] = {
-    "env_id": None,
-    "camera": None,
-    "render": {},
-    "image_size": None,
-    "action_repeat": None,
-    "control_rate": None,
-    "action_low": None,
-    "action_high": None,
-    "seed": None,
-    "seeds_tried": None,
-    "versions": {},
-    "provenance": [],
-    "format_version": FORMAT_VERSION,
-}
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """What a demonstration is without its pictures and observations.
+
+    Attributes:
+        shape: (N, H, W, 3), of the frames.
+        encoder_shape: (N, h, w, 3), of the larger pictures; or None.
+        actions: (T, A) float32; or None.
+        metadata: as of `Demonstration`.
+    """
+
+    shape: tuple[int, ...]
+    encoder_shape: tuple[int, ...] | None
+    actions: NDArray[np.float32] | None
+    metadata: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,11 +124,11 @@ class Demonstration:
         def put(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
 
-        put("frames", _pictures("frames", self.frames))
+        put("frames", check_pictures("frames", self.frames))
         n = len(self.frames)
-        put("metadata", _metadata(self.metadata, list(self.frames.shape[1:3])))
+        put("metadata", check_metadata(self.metadata, list(self.frames.shape[1:3])))
         if self.actions is not None:
-            put("actions", _actions(self.actions, n, self.metadata))
+            put("actions", check_actions(self.actions, n, self.metadata))
         if isinstance(self.observations, dict):
             for key in self.observations:
                 if not isinstance(key, str) or not key or "/" in key or key in _RESERVED:
@@ -128,12 +136,14 @@ class Demonstration:
                         f"observations have a key {key!r}: use text without '/', and none of "
                         f"{_RESERVED}"
                     )
-            checked = {k: _rows(f"observations[{k!r}]", v, n) for k, v in self.observations.items()}
-            put("observations", checked)
+            put(
+                "observations",
+                {k: check_rows(f"observations[{k!r}]", v, n) for k, v in self.observations.items()},
+            )
         elif self.observations is not None:
-            put("observations", _rows("observations", self.observations, n))
+            put("observations", check_rows("observations", self.observations, n))
         if self.encoder_frames is not None:
-            put("encoder_frames", _pictures("encoder_frames", self.encoder_frames))
+            put("encoder_frames", check_pictures("encoder_frames", self.encoder_frames))
             if len(self.encoder_frames) != n:
                 raise ValueError(
                     f"there are {len(self.encoder_frames)} encoder_frames but {n} frames"
@@ -227,118 +237,32 @@ class Demonstration:
             ValueError: if it is no HDF5 file, cut short, not one of ours, or its content is not
                 valid.
         """
-        path = Path(path)
-        if not path.exists():
-            raise FileNotFoundError(
-                f"there is no demonstration {str(path)!r}: "
-                f"record one with 'regil record ENV -o {path}'"
-            )
-        if path.is_dir():
-            raise ValueError(f"demo {str(path)!r} is a folder: name the HDF5 file in it")
-        try:
-            with hdf5.opened(path) as file:
-                return cls(**_read(file, Budget(path.stat().st_size)))
-        except PermissionError:
-            raise
-        except (ValueError, TypeError, KeyError, OSError, RuntimeError, RecursionError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ValueError(f"demo {str(path)!r}: {reason}") from error
+        with _opened(path) as (file, budget):
+            return cls(**_read(file, budget))
+
+    @property
+    def outline(self) -> Outline:
+        """What is known of it without its pictures."""
+        larger = self.encoder_frames
+        return Outline(
+            self.frames.shape, None if larger is None else larger.shape, self.actions, self.metadata
+        )
+
+    @classmethod
+    def load_outline(cls, path: str | os.PathLike[str]) -> Outline:
+        """Read all of a file that `save` wrote but its pictures and observations.
+
+        What is read is checked as `load` does.
+
+        Raises:
+            FileNotFoundError: if there is none.
+            ValueError: as for `load`.
+        """
+        with _opened(path) as (file, budget):
+            return _read_outline(file, budget)
 
 
 _RESERVED = (_FRAMES, _ENCODER_FRAMES)
-
-
-def _pictures(name: str, value: Any) -> NDArray[np.uint8]:
-    array = np.asarray(value)
-    if array.dtype != np.uint8 or array.ndim != 4 or array.shape[-1] != 3 or array.size == 0:
-        raise ValueError(
-            f"{name} are {array.dtype} {array.shape}: they must be uint8 (frames, height, width, 3)"
-        )
-    return np.ascontiguousarray(array)
-
-
-def _rows(name: str, value: Any, n: int) -> NDArray[Any]:
-    array = np.ascontiguousarray(value)
-    if array.dtype.kind not in "biuf" or array.ndim == 0 or len(array) != n or array.size == 0:
-        raise ValueError(
-            f"{name} are {array.dtype} {array.shape}: numbers, one row for each of {n} frames"
-        )
-    if not np.isfinite(array).all():
-        row = int(np.argwhere(~np.isfinite(array))[0][0])
-        raise ValueError(f"{name} have NaN or infinity in row {row}")
-    return array
-
-
-def _actions(value: Any, n: int, metadata: dict[str, Any]) -> NDArray[np.float32]:
-    array = np.asarray(value)
-    if array.dtype.kind != "f" or array.ndim != 2 or array.shape[1] == 0:
-        raise ValueError(f"actions are {array.dtype} {array.shape}: they must be float32 (T, A)")
-    array = np.ascontiguousarray(array, dtype=np.float32)
-    if len(array) not in (n - 1, n) or len(array) == 0:
-        raise ValueError(
-            f"there are {len(array)} actions for {n} frames: there must be {n - 1} (or {n})"
-        )
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        raise ValueError(f"actions[{bad[0][0]}] has NaN or infinity in dimension {bad[0][1]}")
-    for key, outside in (("action_low", np.less), ("action_high", np.greater)):
-        if metadata[key] is None:
-            continue
-        with np.errstate(over="ignore"):  # beyond float32 is no limit
-            limit = np.asarray(metadata[key], dtype=np.float32)
-        if limit.shape != array.shape[1:]:
-            raise ValueError(f"{key} has {limit.size} numbers but actions have {array.shape[1]}")
-        bad = np.argwhere(outside(array, limit))
-        if len(bad):
-            i, a = bad[0]
-            raise ValueError(
-                f"actions[{i}] is {array[i, a]:g} in dimension {a}, beyond {key} {limit[a]:g}: "
-                f"store the clipped action that was executed"
-            )
-    return array
-
-
-def _metadata(given: Any, size: list[int]) -> dict[str, Any]:
-    if not isinstance(given, dict):
-        raise ValueError(f"metadata is {type(given).__name__}: it must be a dict")
-    try:
-        metadata: dict[str, Any] = json.loads(
-            json.dumps(_METADATA_DEFAULTS | given, allow_nan=False)
-        )
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"metadata must hold JSON values only: {error}") from error
-    if metadata["image_size"] is None:
-        metadata["image_size"] = size
-    if metadata["image_size"] != size:
-        raise ValueError(f"metadata image_size is {metadata['image_size']} but frames are {size}")
-    version = metadata["format_version"]
-    if version != FORMAT_VERSION:
-        raise ValueError(
-            f"format_version is {version!r}, this program reads {FORMAT_VERSION}: "
-            f"update regil-wrappers, or record again"
-        )
-    wanted: dict[str, tuple[type, ...]] = {
-        "env_id": (str,),
-        "camera": (str,),
-        "render": (dict,),
-        "action_repeat": (int,),
-        "control_rate": (int, float),
-        "seed": (int,),
-        "seeds_tried": (int,),
-        "versions": (dict,),
-        "provenance": (list,),
-    }
-    for key, types in wanted.items():
-        if metadata[key] is not None and type(metadata[key]) not in types:
-            names = " or ".join(t.__name__ for t in types)
-            raise ValueError(f"metadata {key} is {metadata[key]!r}: it must be {names} or None")
-    for key in ("action_low", "action_high"):
-        value = metadata[key]
-        if value is not None and not (
-            isinstance(value, list) and value and all(type(v) in (int, float) for v in value)
-        ):
-            raise ValueError(f"metadata {key} is {value!r}: it must be a list of numbers or None")
-    return metadata
 
 
 def _sync(path: Path) -> None:
@@ -352,7 +276,27 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def _read(file: h5py.File, budget: Budget) -> dict[str, Any]:
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[h5py.File, Budget]]:
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(
+            f"there is no demonstration {str(path)!r}: record one with 'regil record ENV -o {path}'"
+        )
+    if path.is_dir():
+        raise ValueError(f"demo {str(path)!r} is a folder: name the HDF5 file in it")
+    try:
+        with hdf5.opened(path) as file:
+            yield file, Budget(path.stat().st_size)
+    except PermissionError:
+        raise
+    except (ValueError, TypeError, KeyError, OSError, RuntimeError, RecursionError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"demo {str(path)!r}: {reason}") from error
+
+
+def _groups(file: h5py.File) -> tuple[Any, h5py.Group, h5py.Group, h5py.Group | None]:
+    """Metadata, the demonstration, its observations and its last ones."""
     data = hdf5.member(file, "data", h5py.Group) if hdf5.has(file, "data") else file
     if "regil_metadata" not in data.attrs:
         raise ValueError(
@@ -363,6 +307,31 @@ def _read(file: h5py.File, budget: Budget) -> dict[str, Any]:
     demo = hdf5.member(data, "demo_0", h5py.Group)
     obs = hdf5.member(demo, "obs", h5py.Group)
     final = hdf5.member(demo, "final_obs", h5py.Group) if hdf5.has(demo, "final_obs") else None
+    return metadata, demo, obs, final
+
+
+def _read_outline(file: h5py.File, budget: Budget) -> Outline:
+    metadata, demo, obs, final = _groups(file)
+
+    def shape_of(name: str) -> tuple[int, ...]:
+        shape = hdf5.shape(obs, name, budget)
+        if len(shape) != 4:
+            raise ValueError(f"{name} are of shape {shape}: they must be pictures")
+        return (shape[0] + (final is not None), *shape[1:])
+
+    shape = shape_of(_FRAMES)
+    metadata = check_metadata(metadata, list(shape[1:3]))
+    actions = hdf5.array(demo, "actions", budget) if hdf5.has(demo, "actions") else None
+    return Outline(
+        shape,
+        shape_of(_ENCODER_FRAMES) if hdf5.has(obs, _ENCODER_FRAMES) else None,
+        None if actions is None else check_actions(actions, shape[0], metadata),
+        metadata,
+    )
+
+
+def _read(file: h5py.File, budget: Budget) -> dict[str, Any]:
+    metadata, demo, obs, final = _groups(file)
 
     def joined(name: str) -> NDArray[Any]:
         first = hdf5.array(obs, name, budget)

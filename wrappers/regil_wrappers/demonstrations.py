@@ -2,6 +2,7 @@
 
 * ``Demonstrations`` - what ``demo=`` takes
 * ``demonstrations`` - a sequence of what it names
+* ``outlines`` - what is known of each without reading its pictures
 * ``labels_of`` - what messages call each of them
 """
 
@@ -9,12 +10,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias, overload
 
-from regil_wrappers.demonstration import Demonstration
+from regil_wrappers.demonstration import Demonstration, Outline
 
-__all__ = ["Demonstrations", "as_given", "demonstrations", "labels_of"]
+__all__ = ["Demonstrations", "as_given", "demonstrations", "labels_of", "outlines"]
 
 Demonstrations: TypeAlias = (
     "str | os.PathLike[str] | Demonstration | Sequence[str | os.PathLike[str] | Demonstration]"
@@ -22,16 +24,13 @@ Demonstrations: TypeAlias = (
 """A file, a folder of them, a `Demonstration`, or a list of files or `Demonstration` objects."""
 
 _SUFFIXES = (".hdf5", ".h5")
-_KEPT_BYTES = 512 * 1024**2  # of pictures: files beyond that are read again when asked for
 
 
 class _Files(Sequence[Demonstration]):
-    """Demonstrations that are read when they are asked for."""
+    """Demonstrations that are read when they are asked for, each time: only the first is kept."""
 
     def __init__(self, given: Sequence[str | Demonstration]) -> None:
         self._given = given
-        self._kept: dict[int, Demonstration] = {}
-        self._bytes = 0
 
     def __len__(self) -> int:
         return len(self._given)
@@ -46,16 +45,25 @@ class _Files(Sequence[Demonstration]):
         one = self._given[index]
         if isinstance(one, Demonstration):
             return one
-        if index in self._kept:
-            return self._kept[index]
-        demo = Demonstration.load(one)
-        size = demo.frames.nbytes + (
-            0 if demo.encoder_frames is None else demo.encoder_frames.nbytes
-        )
-        if self._bytes + size <= _KEPT_BYTES:
-            self._kept[index] = demo
-            self._bytes += size
-        return demo
+        return self._first if index == 0 else Demonstration.load(one)
+
+    @cached_property
+    def _first(self) -> Demonstration:
+        one = self._given[0]
+        return one if isinstance(one, Demonstration) else Demonstration.load(one)
+
+    @cached_property
+    def outlines(self) -> list[Outline]:
+        rest = [
+            one.outline if isinstance(one, Demonstration) else Demonstration.load_outline(one)
+            for one in self._given[1:]
+        ]
+        return [self._first.outline, *rest]
+
+
+def outlines(demos: Sequence[Demonstration]) -> list[Outline]:
+    """What is known of each demonstration without its pictures; files' are not read for it."""
+    return demos.outlines if isinstance(demos, _Files) else [demo.outline for demo in demos]
 
 
 def as_given(demo: Demonstrations) -> str | Demonstration | list[str | Demonstration]:
@@ -81,7 +89,7 @@ def demonstrations(
 ) -> Sequence[Demonstration]:
     """What `as_given` named, in order; of a folder, the .hdf5 and .h5 files in it by name.
 
-    Files are read when they are first asked for.
+    Files are read when they are asked for, each time: only the first is kept.
 
     Raises:
         ValueError: if a folder holds no such file.

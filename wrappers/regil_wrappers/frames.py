@@ -216,17 +216,22 @@ def _is_picture(space: gym.Space[Any]) -> bool:
     )
 
 
-def check_recorded_settings(env: Asked, demo: Demonstration, label: str) -> None:
+def check_recorded_settings(env: Asked, metadata: dict[str, Any], label: str) -> None:
     """Refuse a camera, render settings or action repeat other than the recording's.
 
     Environments that do not state theirs (``metadata["regil"]``) pass.
+
+    Args:
+        env: the environment.
+        metadata: the demonstration's.
+        label: what errors call the demonstration.
 
     Raises:
         ValueError: naming the setting and both values.
     """
     here = env.unwrapped.metadata.get("regil") or {}
     for name in _AS_RECORDED:
-        recorded = demo.metadata[name]
+        recorded = metadata[name]
         if recorded not in (None, {}) and here.get(name, recorded) != recorded:
             raise ValueError(
                 f"{label} was recorded with {name} {recorded!r} but the environment has "

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from regil_wrappers.correction import Servo
 from regil_wrappers.demonstration import Demonstration
-from regil_wrappers.demonstrations import labels_of
+from regil_wrappers.demonstrations import labels_of, outlines
 
 __all__ = ["check_guide", "fitting_actions", "make_servo"]
 
@@ -60,30 +60,33 @@ def fitting_actions(
         demos: the demonstrations.
         given: what ``demo=`` was, for messages.
     """
-    return [_fitting(space, *one) for one in zip(demos, labels_of(given), strict=True)]
+    actions = [outline.actions for outline in outlines(demos)]
+    return [_fitting(space, *one) for one in zip(actions, labels_of(given), strict=True)]
 
 
-def _fitting(space: gym.Space[Any], demo: Demonstration, label: str) -> NDArray[np.float32]:
+def _fitting(
+    space: gym.Space[Any], actions: NDArray[np.float32] | None, label: str
+) -> NDArray[np.float32]:
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ValueError(
             f"the action space is {space}: a guide needs continuous actions, a Box of shape (A,)"
         )
-    if demo.actions is None:
+    if actions is None:
         raise ValueError(f"{label} has no actions, so it cannot guide: record one that has")
-    if demo.actions.shape[1:] != space.shape:
+    if actions.shape[1:] != space.shape:
         raise ValueError(
-            f"{label} has actions of size {demo.actions.shape[1]} but the environment takes "
+            f"{label} has actions of size {actions.shape[1]} but the environment takes "
             f"{space.shape[0]}: record it in this environment"
         )
     low, high = space.low.astype(np.float32), space.high.astype(np.float32)
-    outside = np.argwhere((demo.actions < low) | (demo.actions > high))
+    outside = np.argwhere((actions < low) | (actions > high))
     if len(outside):
         i, a = outside[0]
         raise ValueError(
-            f"{label} has action {demo.actions[i, a]:g} in dimension {a} of step {i} but the "
+            f"{label} has action {actions[i, a]:g} in dimension {a} of step {i} but the "
             f"environment takes [{low[a]:g}, {high[a]:g}]: record it in this environment"
         )
-    return demo.actions
+    return actions
 
 
 _DECLARED = {

@@ -5,7 +5,7 @@ external storage are refused. Only deflate, lzf, shuffle and fletcher32 are unpa
 
 * ``opened`` - the file
 * ``has``, ``member`` - an object stored under a name in it
-* ``array`` - a numeric dataset, once its claim fits a `Budget`
+* ``array``, ``shape`` - a numeric dataset, once its claim fits a `Budget`, or only its shape
 * ``encoded_pictures`` - a dataset of JPEG or PNG files
 * ``json_attribute`` - an attribute that holds a JSON text
 """
@@ -27,7 +27,16 @@ from numpy.typing import NDArray
 
 from regil_wrappers.limits import MAX_BYTES, MAX_PIXELS, MAX_TEXT, Budget
 
-__all__ = ["SIGNATURE", "array", "encoded_pictures", "has", "json_attribute", "member", "opened"]
+__all__ = [
+    "SIGNATURE",
+    "array",
+    "encoded_pictures",
+    "has",
+    "json_attribute",
+    "member",
+    "opened",
+    "shape",
+]
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -123,15 +132,34 @@ def array(group: h5py.Group, name: Any, budget: Budget, row: int | None = None) 
     Raises:
         ValueError: if it holds no numbers, claims too much, is kept in another file or damaged.
     """
+    dataset = _numbers(group, name)
+    if row is not None and (not dataset.shape or not -dataset.shape[0] <= row < dataset.shape[0]):
+        raise ValueError(f"{dataset.name!r} has no row {row}")
+    _claim(dataset, dataset.shape if row is None else dataset.shape[1:], budget)
+    return _read(dataset, () if row is None else row)
+
+
+def shape(group: h5py.Group, name: Any, budget: Budget) -> tuple[int, ...]:
+    """The shape of a numeric dataset that `array` could read.
+
+    Raises:
+        ValueError: as `array`, but for damage to the values themselves.
+    """
+    dataset = _numbers(group, name)
+    _claim(dataset, dataset.shape, budget)
+    return tuple(dataset.shape)
+
+
+def _numbers(group: h5py.Group, name: Any) -> h5py.Dataset:
     dataset = member(group, name, h5py.Dataset)
     if dataset.dtype.kind not in "biuf" or dataset.shape is None:
         raise ValueError(f"{dataset.name!r} does not hold numbers")
     _check_storage(dataset)
-    if row is not None and (not dataset.shape or not -dataset.shape[0] <= row < dataset.shape[0]):
-        raise ValueError(f"{dataset.name!r} has no row {row}")
-    shape = dataset.shape if row is None else dataset.shape[1:]
+    return dataset
+
+
+def _claim(dataset: h5py.Dataset, shape: tuple[int, ...], budget: Budget) -> None:
     budget.claim(repr(dataset.name), math.prod(shape) * dataset.dtype.itemsize)
-    return _read(dataset, () if row is None else row)
 
 
 def encoded_pictures(group: h5py.Group, name: str, budget: Budget) -> Iterator[bytes]:

@@ -11,16 +11,17 @@ from __future__ import annotations
 import hashlib
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from regil_wrappers.alignment import squared_distances
 from regil_wrappers.demonstration import Demonstration
+from regil_wrappers.demonstrations import outlines
 from regil_wrappers.encoders import Encoder, embed, fitted
 from regil_wrappers.limits import need
 
@@ -38,10 +39,12 @@ _TRAINED = 64  # frames that a cell's centre is found from
 class Memory:
     """Embeddings of demonstrations' frames.
 
+    Pictures are read one demonstration after the other, once, and twice to fit whitening.
+
     Args:
         demos: the demonstrations.
         encoder: turns their frames into embeddings, one at a time; whitening is fitted on the
-            first demonstration.
+            frames of all.
         use_encoder_frames: whether memory is ``encoder_frames`` instead of ``frames``.
         search: "exact" compares with every frame. "faiss" looks into the 16 of sqrt(frames) cells
             of a `Faiss <https://faiss.ai>`_ inverted file whose centres are nearest, and may miss a
@@ -68,23 +71,35 @@ class Memory:
         use_encoder_frames: bool = False,
         search: Search = "auto",
     ) -> None:
-        parts = []
-        for i, demo in enumerate(demos):
-            frames = demo.encoder_frames if use_encoder_frames else demo.frames
+        shapes = []
+        for i, outline in enumerate(outlines(demos)):
+            shape = outline.encoder_shape if use_encoder_frames else outline.shape
             which = "the demonstration" if len(demos) == 1 else f"demonstration {i}"
-            if frames is None:
+            if shape is None:
                 raise ValueError(f"use_encoder_frames: {which} has no encoder_frames")
-            if i == 0:
-                self.frame_shape = frames.shape[1:]
-                self.encoder = fitted(encoder, frames)
-            elif frames.shape[1:] != self.frame_shape:
+            shapes.append(shape)
+            if shape[1:] != shapes[0][1:]:
                 raise ValueError(
-                    f"{which} has frames {frames.shape[1:]} but the first one {self.frame_shape}: "
+                    f"{which} has frames {shape[1:]} but the first one {shapes[0][1:]}: "
                     "give demonstrations of one size"
                 )
-            parts.append(embed(self.encoder, frames))
-        self.starts = np.concatenate([[0], np.cumsum([len(part) for part in parts])])
-        self.embeddings = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        self.frame_shape = shapes[0][1:]
+        self.starts = np.concatenate([[0], np.cumsum([shape[0] for shape in shapes])])
+
+        def pictures() -> Iterator[NDArray[np.uint8]]:  # of one demonstration at a time
+            for demo in demos:
+                yield cast(
+                    "NDArray[np.uint8]", demo.encoder_frames if use_encoder_frames else demo.frames
+                )
+
+        self.encoder = fitted(encoder, pictures())
+        for i, frames in enumerate(pictures()):
+            part = embed(self.encoder, frames)
+            if i == 0:  # one alone is not copied
+                size = (self.starts[-1], part.shape[1])
+                self.embeddings = part if len(demos) == 1 else np.empty(size, np.float32)
+            if len(demos) > 1:
+                self.embeddings[self.starts[i] : self.starts[i + 1]] = part
         self.embeddings.flags.writeable = False
         self.parts = [
             self.embeddings[a:b] for a, b in zip(self.starts, self.starts[1:], strict=False)
@@ -101,11 +116,11 @@ class Memory:
             _, index = np.unique(self._distinct_of, return_index=True)
             self._distinct = np.ascontiguousarray(self.embeddings[index])
         if search == "auto":
-            large = len(parts) > 1 and len(self.embeddings) > EXACT_FRAMES
+            large = len(demos) > 1 and len(self.embeddings) > EXACT_FRAMES
             search = "faiss" if large and find_spec("faiss") is not None else "exact"
             if large and search == "exact":
                 warnings.warn(
-                    f"{len(self.embeddings)} frames of {len(parts)} demonstrations are compared "
+                    f"{len(self.embeddings)} frames of {len(demos)} demonstrations are compared "
                     "with one by one: pip install 'regil-wrappers[faiss]' makes that faster, "
                     "search='exact' silent",
                     stacklevel=2,

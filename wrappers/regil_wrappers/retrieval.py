@@ -23,6 +23,7 @@ from regil_wrappers.alignment import (
     warping_path,
 )
 from regil_wrappers.demonstration import Demonstration
+from regil_wrappers.demonstrations import outlines
 from regil_wrappers.encoders import Encoder, check_embedding, make_encoder
 from regil_wrappers.latency import Latency
 from regil_wrappers.memory import SEARCHES, Memory, Search
@@ -114,7 +115,8 @@ class Retriever:
     ) -> None:
         demos = [demo] if isinstance(demo, Demonstration) else demo
         labels = None if len(demos) == 1 else [f"demonstration {i}" for i in range(len(demos))]
-        check_settings([len(one) for one in demos], k, horizon, step_pattern, labels, search)
+        lengths = [outline.shape[0] for outline in outlines(demos)]
+        check_settings(lengths, k, horizon, step_pattern, labels, search)
         self.latency = Latency(deadline_ms)
         encoder = make_encoder(encoder) if isinstance(encoder, str) else encoder
         self.k = k

@@ -12,7 +12,13 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from regil_wrappers.demonstration import Demonstration
-from regil_wrappers.demonstrations import Demonstrations, as_given, demonstrations, labels_of
+from regil_wrappers.demonstrations import (
+    Demonstrations,
+    as_given,
+    demonstrations,
+    labels_of,
+    outlines,
+)
 from regil_wrappers.encoders import Encoder, make_encoder
 from regil_wrappers.episode import Episode
 from regil_wrappers.frames import Asked, FrameSource, check_recorded_settings
@@ -217,9 +223,9 @@ def check_demonstrations(
     Latency(settings["deadline_ms"])
     labels = labels_of(settings["demo"])
     lengths = []
-    for demo, label in zip(demos, labels, strict=True):
-        lengths.append(len(demo))
-        check_recorded_settings(env, demo, label)
+    for outline, label in zip(outlines(demos), labels, strict=True):
+        lengths.append(outline.shape[0])
+        check_recorded_settings(env, outline.metadata, label)
     check_settings(
         lengths,
         settings["k"],

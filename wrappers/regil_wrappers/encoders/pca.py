@@ -55,7 +55,7 @@ def principal_axes(
     rank = int((squares > 1e-10 * squares[0]).sum()) if squares[0] > 0 else 0
     if n > rank:
         raise ValueError(
-            f"whiten={n}: the demonstration's {rows} frames span {rank} directions of the "
+            f"whiten={n}: the {rows} frames it is fitted on span {rank} directions of the "
             + (f"features: choose whiten={rank} or less" if rank else "features: all are equal")
         )
     axes = vectors[:, :n]
