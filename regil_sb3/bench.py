@@ -118,7 +118,7 @@ def retrieval(blocks: int = 30, steps: int = 50) -> list[Row]:
         from tslearn.metrics import dtw_subsequence_path  # type: ignore[import-untyped]
     except ModuleNotFoundError as error:
         raise ValueError(
-            f"table 'retrieval' compares with tslearn ({error}): pip install tslearn"
+            f"table 'retrieval' compares with tslearn ({error}): pip install 'regil-sb3[bench]'"
         ) from None
     from regil_wrappers.demonstration import Demonstration
     from regil_wrappers.retrieval import Retriever
@@ -187,7 +187,8 @@ def _compare(
 
 TABLES: dict[str, Callable[[], list[Row]]] = {"rendering": rendering, "retrieval": retrieval}
 """Tables by name."""
-_EPISODES = ("ranking", "guide", "success-buffer")
+_ROOMS = ("ranking", "guide", "success-buffer", "latency")
+_OPTIONS = {"latency": ("encoders", "frames")}
 
 
 def main(table: str, **options: Any) -> list[Row]:
@@ -195,11 +196,11 @@ def main(table: str, **options: Any) -> list[Row]:
 
     Args:
         table: one of `TABLES`, "ranking" (`regil_sb3.bench_rewards`), "guide" or "success-buffer"
-            (`regil_sb3.bench_guide`).
-        **options: of the last two.
+            (`regil_sb3.bench_guide`), "latency" (`regil_sb3.bench_latency`).
+        **options: the table's own.
 
     Returns:
-        its rows; none for those of episodes, not of times.
+        rows of `TABLES`; the others give none.
 
     Raises:
         ValueError: where there is no such table, or it has no such option.
@@ -209,15 +210,21 @@ def main(table: str, **options: Any) -> list[Row]:
 
         bench_guide.main(table, **options)
         return []
-    if options:
-        raise ValueError(f"the table {table!r} has no option --{next(iter(options))}")
+    for name in options:
+        if name not in _OPTIONS.get(table, ()):
+            raise ValueError(f"the table {table!r} has no option --{name}")
+    if table == "latency":
+        from regil_sb3 import bench_latency
+
+        bench_latency.main(**options)
+        return []
     if table == "ranking":
         from regil_sb3 import bench_rewards
 
         bench_rewards.main()
         return []
     if table not in TABLES:
-        raise ValueError(f"table {table!r} is not one of {', '.join([*TABLES, *_EPISODES])}")
+        raise ValueError(f"table {table!r} is not one of {', '.join([*TABLES, *_ROOMS])}")
     rows = TABLES[table]()
     width = max(len(row.what) for row in rows)
     print(f"{table:{width}}  median ms  times the first")

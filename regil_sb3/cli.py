@@ -87,13 +87,20 @@ def _parser() -> argparse.ArgumentParser:
 
     bench = commands.add_parser("bench", help="measure, as ratios in one run")
     bench.add_argument(
-        "table", help="retrieval, rendering, ranking, guide or success-buffer; the last two take:"
+        "table", help="retrieval, rendering, ranking, guide, success-buffer or latency"
     )
-    bench.add_argument("--tasks", nargs="+", metavar="TASK", help="Meta-World's (the paper's 7)")
-    bench.add_argument("--seeds", nargs="+", type=int, help="of demonstrations (0 1; 0)")
+    bench.add_argument(
+        "--tasks",
+        nargs="+",
+        metavar="TASK",
+        help="guide, success-buffer: Meta-World's (the paper's 7)",
+    )
+    bench.add_argument("--seeds", nargs="+", type=int, help="the same: of demonstrations (0 1; 0)")
     bench.add_argument("--episodes", type=int, help="guide: goals of each (20)")
     bench.add_argument("--disturbances", nargs="+", metavar="NAME", help="guide: (none)")
     bench.add_argument("--steps", type=int, help="success-buffer: agent steps (5000)")
+    bench.add_argument("--encoders", nargs="+", metavar="NAME", help="latency: (those at hand)")
+    bench.add_argument("--frames", nargs="+", type=int, help="latency: of the demonstration")
     return parser
 
 
@@ -261,7 +268,7 @@ def main(argv: list[str] | None = None) -> int:
         elif args.command == "bench":
             from regil_sb3 import bench
 
-            names = ("tasks", "seeds", "episodes", "disturbances", "steps")
+            names = ("tasks", "seeds", "episodes", "disturbances", "steps", "encoders", "frames")
             given = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
             bench.main(args.table, **given)
     except KeyboardInterrupt:

@@ -1,0 +1,56 @@
+"""What a measured figure depends on: the machine, the versions, the commit."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import psutil
+
+__all__ = ["describe"]
+
+
+def describe(packages: Sequence[str]) -> str:
+    """One line to stand below a table: processor, memory, threads, versions, commit.
+
+    Args:
+        packages: distributions whose versions matter; those that are not installed are left out.
+    """
+    parts = [
+        f"{_processor()}, {os.cpu_count()} cores",
+        f"{psutil.virtual_memory().total / 1024**3:.0f} GiB",
+        f"OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS', 'unset')}",
+        f"Python {platform.python_version()}",
+    ]
+    for name in packages:
+        try:
+            parts.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return ", ".join([*parts, f"commit {_commit()}"])
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _commit() -> str:
+    """Of the checkout that this file is in, with a + where something in it was changed."""
+    here = Path(__file__).parent
+    try:
+        done = [
+            subprocess.run(["git", "-C", here, *words], capture_output=True, text=True, check=True)
+            for words in (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "-uno"))
+        ]
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return done[0].stdout.strip() + ("+" if done[1].stdout.strip() else "")
