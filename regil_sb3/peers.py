@@ -95,7 +95,8 @@ def _double(rows: Array) -> Array:
 
 def _double_columns(rows: Array) -> Array:
     """(D, N), frames lying as rows in memory: librosa turns it back without a copy."""
-    return _double(rows).T
+    columns: Array = _double(rows).T
+    return columns
 
 
 PEERS = (
