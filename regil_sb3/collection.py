@@ -15,27 +15,21 @@ _REWARDS = ("env_reward", "retrieval_reward")
 class Collection:
     """The open episodes of some environments.
 
-    An episode of the warm-up is the guide's. Of the others the policy begins each, and the guide
-    finishes a share: it takes over at a step drawn at random, and what it would have done before is
-    noted too. An episode that succeeds so shows the way back from where the policy gets to.
+    An episode of the warm-up is the guide's, to its end; the others are the policy's.
 
     Args:
         n_envs: environments.
         action_shape: (A,) of one action.
-        guide_share: probability that the guide finishes an episode that the policy began.
-        keeps_own: whether episodes that are the policy's alone are kept too.
-        latest: the guide takes over before this step: the demonstration's length.
+        keeps_own: whether the policy's episodes are kept too.
+
+    Attributes:
+        warmup: (n_envs,) bool: where the guide acts.
+        lengths: (n_envs,) int: steps of each open episode.
+        succeeded: (n_envs,) bool: whether it succeeded at any step.
     """
 
-    def __init__(
-        self,
-        n_envs: int,
-        action_shape: tuple[int, ...],
-        guide_share: float,
-        keeps_own: bool,
-        latest: int,
-    ) -> None:
-        self._guide_share, self._keeps_own, self._latest = guide_share, keeps_own, latest
+    def __init__(self, n_envs: int, action_shape: tuple[int, ...], keeps_own: bool) -> None:
+        self._keeps_own = keeps_own
         self._labels = np.zeros((n_envs, *action_shape), np.float32)
         self.restart(False)
 
@@ -45,7 +39,6 @@ class Collection:
         self.warmup = np.full(n_envs, warmup)
         self.lengths = np.zeros(n_envs, int)
         self.succeeded = np.zeros(n_envs, bool)
-        self._takeover = np.zeros(n_envs)
         self._demonstrates = np.zeros(n_envs, bool)  # an episode's first step tells
         self._steps: list[list[tuple[Any, npt.NDArray[Any]]]] = [[] for _ in range(n_envs)]
         self._returns = {name: np.zeros(n_envs) for name in _REWARDS}
@@ -55,27 +48,17 @@ class Collection:
     def begin(self, env: int, warmup: bool) -> None:
         """The environment's next episode begins, in the warm-up or not."""
         self.warmup[env] = warmup
-        shared = not warmup and self._guide_share > 0 and np.random.rand() < self._guide_share
-        own = np.random.randint(self._latest) if shared else np.inf
-        self._takeover[env] = 0 if warmup else own
         self.lengths[env] = 0
         self.succeeded[env] = self._demonstrates[env] = False
         self._steps[env] = []
         for returns in self._returns.values():
             returns[env] = 0.0
 
-    @property
-    def guided(self) -> npt.NDArray[np.bool_]:
-        """(n_envs,) where the guide acts now."""
-        return self.lengths >= self._takeover
-
-    @property
-    def labelled(self) -> npt.NDArray[np.bool_]:
-        """(n_envs,) where the guide's action is noted, whoever acts."""
-        return np.isfinite(self._takeover)
-
     def note_guide(self, indices: npt.NDArray[Any], actions: npt.NDArray[Any]) -> None:
-        """What the guides of these environments would do now, (n, A), scaled to [-1, 1]."""
+        """What the guides of these environments say, (n, A) scaled to [-1, 1]: it is what is kept.
+
+        What is executed may be disturbed.
+        """
         self._labels[indices] = actions
 
     def step(
@@ -92,14 +75,14 @@ class Collection:
         """
         retrieval = info.get("retrieval", {})
         self._demonstrates[env] = not retrieval.get("calibrating", False)
-        labelled = self.labelled[env]
-        if labelled or self._keeps_own:
+        guided = self.warmup[env]
+        if guided or self._keeps_own:
             before = (
                 {k: v[env].copy() for k, v in seen.items()}
                 if isinstance(seen, dict)
                 else np.array(seen[env])
             )
-            noted = self._labels[env] if labelled else action
+            noted = self._labels[env] if guided else action
             self._steps[env].append((before, noted.copy()))
         late = np.sum(retrieval.get("episode_rewards", 0.0))
         self._returns["env_reward"][env] += retrieval.get("env_reward", reward)

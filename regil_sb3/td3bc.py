@@ -85,8 +85,6 @@ class TD3BC(TD3):
         target_policy_noise: std of the target's smoothing noise.
         target_noise_clip: its limit.
         warmup_steps: steps in which the guide acts. An episode begun in warm-up is finished in it.
-        guide_share: after the warm-up, the share of episodes that the guide takes over from the
-            policy at a random step; the guide's own actions are what is kept of them.
         bc_coef: lambda at the start; 0 for no BC term.
         bc_floor: lambda's floor as a share of ``bc_coef``.
         bc_steps: steps until lambda would reach 0; None is the whole of ``learn``.
@@ -156,7 +154,6 @@ class TD3BC(TD3):
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.3,
         warmup_steps: int = 5_000,
-        guide_share: float = 0.0,
         bc_coef: float = 2.0,
         bc_floor: float = 0.1,
         bc_steps: int | None = None,
@@ -186,7 +183,7 @@ class TD3BC(TD3):
         if isinstance(env, gym.Env | VecEnv) and not isinstance(env.action_space, spaces.Box):
             raise ValueError(f"the action space is {env.action_space}: TD3BC needs a Box")
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
-        self.warmup_steps, self.guide_share = warmup_steps, guide_share
+        self.warmup_steps = warmup_steps
         self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps
         self.bc_schedule = bc_schedule
         self.keep_own_successes, self.actor_in_warmup = keep_own_successes, actor_in_warmup
@@ -283,9 +280,7 @@ class TD3BC(TD3):
         self._collection = Collection(
             self.n_envs,
             self.action_space.shape,
-            self.guide_share,
             self.keep_own_successes,
-            len(self.demo) if self.demo is not None else 1,
         )
 
     def _check_demo(self) -> None:
@@ -318,12 +313,11 @@ class TD3BC(TD3):
         if self.bc_coef > 0 and not self.success_buffer.steps:
             assert self.demo is not None
             self._add_demonstration(self.demo)
-        for name in ("warmup_steps", "guide_share"):
-            if getattr(self, name) > 0 and not self.env.has_attr("guide_action"):
-                raise ValueError(
-                    f"{name}={getattr(self, name)} needs a guide: wrap the environment in "
-                    f"regil_wrappers.RetrievalGuideWrapper, or set {name}=0"
-                )
+        if self.warmup_steps > 0 and not self.env.has_attr("guide_action"):
+            raise ValueError(
+                f"warmup_steps={self.warmup_steps} needs a guide: wrap the environment in "
+                "regil_wrappers.RetrievalGuideWrapper, or set warmup_steps=0"
+            )
         if self.reward_scale == "auto":
             self.used_reward_scale = 1.0
             if self.env.has_attr("reward_scale"):
@@ -364,7 +358,7 @@ class TD3BC(TD3):
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
         assert isinstance(self.action_space, spaces.Box)
         assert self.env is not None
-        guided, labelled = self._collection.guided, self._collection.labelled
+        guided = self._collection.warmup
         if guided.all():
             action = np.zeros((n_envs, *self.action_space.shape), np.float32)
             buffer_action = action.copy()
@@ -377,16 +371,12 @@ class TD3BC(TD3):
                 # float32 may put an unscaled bound outside by its last bit
                 action = self.policy.unscale_action(buffer_action)
                 action = action.clip(self.action_space.low, self.action_space.high)
-        if labelled.any():
-            indices = np.flatnonzero(labelled)
-            suggested = self._guide_actions("guide_action", indices)
-            self._collection.note_guide(indices, self.policy.scale_action(suggested))
         if guided.any():
             indices = np.flatnonzero(guided)
-            disturbs = self.env.has_attr("disturbed_action")
-            suggested = self._guide_actions(
-                "disturbed_action" if disturbs else "guide_action", indices
-            )
+            suggested = self._guide_actions("guide_action", indices)
+            self._collection.note_guide(indices, self.policy.scale_action(suggested))
+            if self.env.has_attr("disturbed_action"):
+                suggested = self._guide_actions("disturbed_action", indices)
             action[indices] = suggested
             buffer_action[indices] = self.policy.scale_action(suggested)
         self._in_step = True
@@ -429,7 +419,7 @@ class TD3BC(TD3):
 
     def _end_episode(self, env: int) -> None:
         episodes = self._collection
-        if not episodes.labelled[env]:
+        if not episodes.warmup[env]:
             part = episodes.lengths[env] / max(self._total_timesteps - self.warmup_steps, 1)
             self._by_success.episode(bool(episodes.succeeded[env]), part)
         shown = episodes.demonstration(env)
