@@ -187,7 +187,7 @@ def _compare(
 
 TABLES: dict[str, Callable[[], list[Row]]] = {"rendering": rendering, "retrieval": retrieval}
 """Tables by name."""
-_ROOMS = ("ranking", "guide", "success-buffer", "latency")
+_ROOMS = ("ranking", "guide", "success-buffer", "latency", "throughput")
 _OPTIONS = {"latency": ("encoders", "frames")}
 
 
@@ -196,7 +196,8 @@ def main(table: str, **options: Any) -> list[Row]:
 
     Args:
         table: one of `TABLES`, "ranking" (`regil_sb3.bench_rewards`), "guide" or "success-buffer"
-            (`regil_sb3.bench_guide`), "latency" (`regil_sb3.bench_latency`).
+            (`regil_sb3.bench_guide`), "latency" (`regil_sb3.bench_latency`), "throughput"
+            (`regil_sb3.bench_throughput`).
         **options: the table's own.
 
     Returns:
@@ -217,6 +218,11 @@ def main(table: str, **options: Any) -> list[Row]:
         from regil_sb3 import bench_latency
 
         bench_latency.main(**options)
+        return []
+    if table == "throughput":
+        from regil_sb3 import bench_throughput
+
+        bench_throughput.main()
         return []
     if table == "ranking":
         from regil_sb3 import bench_rewards

@@ -87,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
 
     bench = commands.add_parser("bench", help="measure, as ratios in one run")
     bench.add_argument(
-        "table", help="retrieval, rendering, ranking, guide, success-buffer or latency"
+        "table", help="retrieval, rendering, ranking, guide, success-buffer, latency or throughput"
     )
     bench.add_argument(
         "--tasks",
