@@ -27,6 +27,14 @@ def toy(steps: int, **settings: Any) -> gym.Env[Any, Any]:
     return gym.wrappers.TimeLimit(ToyReach(frozen=False, **settings), steps)
 
 
+class Talks(gym.Wrapper):  # type: ignore[type-arg]
+    """Has infos of the same name."""
+
+    def step(self, action: Any) -> Any:
+        *others, info = super().step(action)
+        return *others, {**info, "retrieval": {"cost": -1, "mine": 2}}
+
+
 def stack(room: Any, env: Any, demo: Any, order: str, guide: Any, **settings: Any) -> Any:
     """`room` has the wrappers for one environment, or for several."""
     shared = {k: v for k, v in settings.items() if k not in ("reward", "mode", "weight")}
@@ -101,7 +109,8 @@ def play(envs: tuple[Vector, Vector], mode: AutoresetMode, steps: int, choose: A
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("order", ORDERS)
 def test_a_stack(mode: AutoresetMode, order: str, demo_path: str) -> None:
-    assert play(both(mode, demo_path, order), mode, 30) >= 8
+    envs = both(mode, demo_path, order, lambda n: Talks(toy(n)))
+    assert play(envs, mode, 30) >= 8
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -100,6 +100,10 @@ class _RetrievalWrapper(VectorWrapper[ObsType, ActType, ObsType, ActType, Array]
 
     def _tell(self, infos: Infos, after: Said, begun: Said, over: Any = None) -> None:
         """Put into infos what is said of steps and beginnings, and no wrapper inside has said."""
+        if self._owns:
+            for there in (infos, infos.get("final_info", {})):  # an environment's own goes
+                there.pop("retrieval", None)
+                there.pop("_retrieval", None)
         for i, said in after.items():
             last = self._last_infos(infos, over[i])
             new = {"retrieval": _unsaid(last, i, said)}
