@@ -338,7 +338,11 @@ def test_what_does_not_fit(demo_path: str) -> None:
     ):
         refused(make, message)
     env = guide(three, demo_path)
+    rewarded = reward(three, demo_path)
+    three.reset()  # not the wrappers
     refused(env.guide_action, r"call reset\(\)")
+    refused(lambda: env.step(np.zeros((3, 2))), r"call reset\(\)")
+    refused(lambda: rewarded.step(np.zeros((3, 2))), r"call reset\(\)")
     env.reset()
     refused(lambda: env.step(np.zeros((2, 2))), r"shape \(2, 2\): 3 environments take \(3, 2\)")
     refused(lambda: env.set_calibration({}), "takes no calibration")

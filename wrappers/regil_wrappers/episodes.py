@@ -151,8 +151,13 @@ class Episodes:
             stepped: by environment, what a step led to, as `FrameSource.raw` gives it; where it
                 ended an episode, that episode's last.
             begun: by environment, what its new episode began with.
+
+        Raises:
+            ValueError: if a step was made before the first episode began.
         """
         self.stepped = {i: self.current[i] for i in stepped}
+        for episode in self.stepped.values():
+            _ = episode.last
         pictures = [self.current[i].picture(raw) for i, raw in stepped.items()]
         self.begun = {i: self.current[i].another() for i in begun}
         pictures += [self.begun[i].picture(raw) for i, raw in begun.items()]

@@ -151,7 +151,8 @@ class FrameSource:
             raise ValueError(
                 f"{why}, but these environments begin the next episode before the last picture of "
                 "one can be asked for: put the picture into observations "
-                "(gymnasium.wrappers.AddRenderObservation) and use image='obs' or 'obs:KEY'"
+                "(gymnasium.wrappers.AddRenderObservation) and use image='obs' or 'obs:KEY', or "
+                "another autoreset mode where there is one"
             )
 
     def another(self) -> FrameSource:
