@@ -242,6 +242,9 @@ def one(case: int, made: dict[str, tuple[Path, str]], folder: Path) -> str:
     copy(source, target)
     try:
         spoil(target, rng, other)
+        if format == "regil" and rng.random() < 0.3:
+            Demonstration.load_outline(target)
+            return "read"
         chosen = None if rng.random() < 0.3 else format
         formats.read(target, chosen, size=8 if rng.random() < 0.5 else None)
         return "read"

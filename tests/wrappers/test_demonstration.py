@@ -71,6 +71,9 @@ def test_saved_and_loaded(given: dict[str, Any], tmp_path: Path) -> None:
         same(getattr(demo, name), getattr(loaded, name))
     assert loaded.metadata == demo.metadata
     assert len(loaded) == len(given["frames"])
+    outline = Demonstration.load_outline(tmp_path / "new" / "demo.hdf5")
+    assert vars(outline) | {"actions": None} == vars(loaded.outline) | {"actions": None}
+    same(outline.actions, loaded.actions)
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["demo.hdf5"]
 
 

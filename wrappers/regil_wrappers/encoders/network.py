@@ -55,7 +55,7 @@ class NetworkEncoder:
     ) -> None:
         self._torch = torch = import_torch()
         self._device = check_execution(device, precision, compile, batch)
-        self._network = network.eval().requires_grad_(False).to(self._device)
+        self._network = network.eval().to(self._device)
         self._features = torch.compile(features) if compile else features
         self._precision = precision
         self._batch = batch

@@ -95,9 +95,12 @@ class TimmEncoder(NetworkEncoder):
                 f"timm {timm.__version__} has no model of that name"
                 + (f": did you mean one of {close}?" if close else "")
             )
-        config = timm.get_pretrained_cfg(model)
+        try:
+            config = timm.get_pretrained_cfg(model)
+        except RuntimeError as error:
+            raise ValueError(f"timm {timm.__version__}: {error}") from error
         if config is None:
-            raise ValueError(f"timm {timm.__version__} has no model {model!r} of that tag")
+            raise ValueError(f"timm {timm.__version__} has no weights for {model!r}")
         path = timm_weights(timm, model, file)
         options: dict[str, Any] = {"pretrained_cfg_overlay": {"file": str(path)}}
         if size is not None and config.fixed_input_size:

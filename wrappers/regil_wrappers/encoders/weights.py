@@ -17,6 +17,9 @@ from regil_wrappers.encoders.network import import_torch
 
 __all__ = ["find_weights", "read_weights", "timm_weights", "weights_folder"]
 
+# What a repository of timm's holds, unless timm says otherwise; older ones have the second alone.
+_HUB_NAMES = ("model.safetensors", "pytorch_model.bin")
+
 
 def weights_folder() -> Path:
     """The folder that ``REGIL_ENCODERS`` names, else ``encoders`` in the user's cache folder."""
@@ -47,24 +50,32 @@ def timm_weights(timm: Any, model: str, file: str | None) -> Path:
     """
     config = timm.get_pretrained_cfg(model)
     full = config.architecture + (f".{config.tag}" if config.tag else "")
-    found = find_weights(f"{full}.safetensors", file)
+    found = find_weights(f"{full}.safetensors", file) or find_weights(f"{full}.bin", None)
     if found is not None:
         return found
-    repository, name = config.hf_hub_id, config.hf_hub_filename or "model.safetensors"
+    repository = config.hf_hub_id
     if not repository:
         raise ValueError(f"timm has no weights for {model!r}: add '@' and a checkpoint's path")
+    names = [config.hf_hub_filename] if config.hf_hub_filename else list(_HUB_NAMES)
     hub = import_module("huggingface_hub")
-    cached = hub.try_to_load_from_cache(repository, name)
-    if isinstance(cached, str):
-        return Path(cached)
-    url = hub.hf_hub_url(repository, name)
-    try:
-        hub.get_hf_file_metadata(url, timeout=5)
-        return Path(hub.hf_hub_download(repository, name))
-    except Exception as error:  # the hub and its client raise a dozen unrelated types here
-        raise ValueError(
-            missing_weights(url, f"{full}.safetensors", f"no download: {type(error).__name__}")
-        ) from error
+    for name in names:
+        cached = hub.try_to_load_from_cache(repository, name)
+        if isinstance(cached, str):
+            return Path(cached)
+    for name in names:
+        try:
+            hub.get_hf_file_metadata(hub.hf_hub_url(repository, name), timeout=5)
+            return Path(hub.hf_hub_download(repository, name))
+        except Exception as error:  # the hub and its client raise a dozen unrelated types here
+            failed = error
+            if not isinstance(error, import_module("huggingface_hub.errors").EntryNotFoundError):
+                break
+    source = hub.hf_hub_url(repository, names[0])
+    if len(names) > 1:
+        source += f" (where there is none, {names[1]} beside it, for {full}.bin)"
+    raise ValueError(
+        missing_weights(source, f"{full}.safetensors", f"no download: {type(failed).__name__}")
+    ) from failed
 
 
 def missing_weights(source: str, name: str, reason: str) -> str:
