@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from functools import partial
 from typing import Any
 
@@ -82,11 +83,15 @@ def play(envs: tuple[Vector, Vector], mode: AutoresetMode, steps: int, choose: A
     """Both the same way, all they return compared; how many episodes ended."""
     rng = np.random.default_rng(1)
     n = envs[0].num_envs
-    seeds = [5, 3, 7, 8][:n] if choose is None else 5
-    for a, b in zip(*(env.reset(seed=seeds) for env in envs), strict=True):
-        same(a, b)
+    seeds = [5, 3, 7, 8][:n]
+
+    def reset(**given: Any) -> None:  # options anew: an environment takes the mask out of them
+        for a, b in zip(*(env.reset(**copy.deepcopy(given)) for env in envs), strict=True):
+            same(a, b)
+
+    reset(seed=seeds if choose is None else 5)
     ended = 0
-    for _ in range(steps):
+    for t in range(steps):
         actions = rng.uniform(-1, 1, envs[0].action_space.shape).astype(np.float32)
         if choose is not None:
             actions = choose(actions)
@@ -96,11 +101,11 @@ def play(envs: tuple[Vector, Vector], mode: AutoresetMode, steps: int, choose: A
         over = results[0][2] | results[0][3]
         ended += over.sum()
         if mode == AutoresetMode.DISABLED and over.any():
-            for a, b in zip(
-                *(env.reset(options={"reset_mask": over.copy(), "x": 1}) for env in envs),
-                strict=True,
-            ):
-                same(a, b)
+            reset(options={"reset_mask": over, "x": 1})
+        if choose is None and t == 6:  # an episode has ended, one goes on and one is not asked
+            reset(seed=seeds, options={"reset_mask": np.array([True, True, False, False][:n])})
+        if choose is None and t == 14:
+            reset(seed=2)
     for env in envs:
         env.close()
     return int(ended)
