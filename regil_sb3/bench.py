@@ -187,8 +187,12 @@ def _compare(
 
 TABLES: dict[str, Callable[[], list[Row]]] = {"rendering": rendering, "retrieval": retrieval}
 """Tables by name."""
-_ROOMS = ("ranking", "guide", "success-buffer", "latency", "throughput")
-_OPTIONS = {"latency": ("encoders", "frames")}
+_ROOMS = ("ranking", "guide", "success-buffer", "latency", "memory", "index", "throughput")
+_OPTIONS = {
+    "latency": ("encoders", "frames"),
+    "memory": ("frames", "dims", "plot"),
+    "index": ("frames", "dims"),
+}
 
 
 def main(table: str, **options: Any) -> list[Row]:
@@ -196,8 +200,8 @@ def main(table: str, **options: Any) -> list[Row]:
 
     Args:
         table: one of `TABLES`, "ranking" (`regil_sb3.bench_rewards`), "guide" or "success-buffer"
-            (`regil_sb3.bench_guide`), "latency" (`regil_sb3.bench_latency`), "throughput"
-            (`regil_sb3.bench_throughput`).
+            (`regil_sb3.bench_guide`), "latency" (`regil_sb3.bench_latency`), "memory" or "index"
+            (`regil_sb3.bench_memory`), "throughput" (`regil_sb3.bench_throughput`).
         **options: the table's own.
 
     Returns:
@@ -218,6 +222,11 @@ def main(table: str, **options: Any) -> list[Row]:
         from regil_sb3 import bench_latency
 
         bench_latency.main(**options)
+        return []
+    if table in ("memory", "index"):
+        from regil_sb3 import bench_memory
+
+        bench_memory.main(table, **options)
         return []
     if table == "throughput":
         from regil_sb3 import bench_throughput

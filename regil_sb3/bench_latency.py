@@ -290,6 +290,7 @@ def main(**options: Any) -> list[Row]:
         **options: of `latency`.
     """
     process.set_threads()
+    process.keep_freed_memory()  # as regil train does
     rows: list[Row] = []
     print("\n".join(table([])), flush=True)
     for row in latency(**options):

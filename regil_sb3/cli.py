@@ -87,7 +87,9 @@ def _parser() -> argparse.ArgumentParser:
 
     bench = commands.add_parser("bench", help="measure, as ratios in one run")
     bench.add_argument(
-        "table", help="retrieval, rendering, ranking, guide, success-buffer, latency or throughput"
+        "table",
+        help="rendering, retrieval, ranking, guide, success-buffer, latency, memory, index or "
+        "throughput",
     )
     bench.add_argument(
         "--tasks",
@@ -100,7 +102,11 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--disturbances", nargs="+", metavar="NAME", help="guide: (none)")
     bench.add_argument("--steps", type=int, help="success-buffer: agent steps (5000)")
     bench.add_argument("--encoders", nargs="+", metavar="NAME", help="latency: (those at hand)")
-    bench.add_argument("--frames", nargs="+", type=int, help="latency: of the demonstration")
+    bench.add_argument(
+        "--frames", nargs="+", type=int, help="latency, memory, index: sizes of memory"
+    )
+    bench.add_argument("--dims", type=int, help="memory, index: of the embeddings (384)")
+    bench.add_argument("--plot", metavar="FILE", help="memory: draw it")
     return parser
 
 
@@ -268,8 +274,8 @@ def main(argv: list[str] | None = None) -> int:
         elif args.command == "bench":
             from regil_sb3 import bench
 
-            names = ("tasks", "seeds", "episodes", "disturbances", "steps", "encoders", "frames")
-            given = {n: getattr(args, n) for n in names if getattr(args, n) is not None}
+            own = ("command", "table")
+            given = {n: v for n, v in vars(args).items() if n not in own and v is not None}
             bench.main(args.table, **given)
     except KeyboardInterrupt:
         return 130
