@@ -62,7 +62,7 @@ class _Files(Sequence[Demonstration]):
 
 
 def outlines(demos: Sequence[Demonstration]) -> list[Outline]:
-    """What is known of each demonstration without its pictures; files' are not read for it."""
+    """What is known of each without its pictures: of files only the first is read whole."""
     return demos.outlines if isinstance(demos, _Files) else [demo.outline for demo in demos]
 
 
