@@ -140,18 +140,19 @@ def measure(frames: int, dims: int = DIMS) -> list[Row]:
     ends: dict[Search, list[tuple[int, int]]] = {search: [] for search in SEARCHES}
     shared = []
     for episode in _episodes(pictures):
+        wanted = []
         for search, retriever in retrievers.items():
             retriever.reset()
-            for vector in episode:
+            for i, vector in enumerate(episode):
                 begun = perf_counter()
                 alignment = retriever.step_embedding(vector)
                 times[search].append(perf_counter() - begun)
                 ends[search].append((alignment.demonstration, alignment.end))
-        exact, near = (retriever.memory for retriever in retrievers.values())
-        for vector in episode:
-            wanted = nearest(exact.distances(vector), _K)
-            found, _ = near.nearest(vector, _K)
-            shared.append(len(set(wanted.tolist()) & set(found.tolist())) / _K)
+                if search == "exact":
+                    wanted.append(nearest(retriever.distances, _K))
+                else:
+                    found, _ = retriever.memory.nearest(vector, _K)
+                    shared.append(len(set(wanted[i].tolist()) & set(found.tolist())) / _K)
     same = np.mean([a == b for a, b in zip(*ends.values(), strict=True)])
     rows = []
     for search, retriever in retrievers.items():
@@ -203,6 +204,8 @@ def _check(frames: Sequence[int], dims: int) -> None:
     for size in frames:
         if not 10 * _K <= size <= _UNSEEN * LENGTH:
             raise ValueError(f"--frames {size}: choose {10 * _K} to {_UNSEEN * LENGTH}")
+        if 0 < size % LENGTH <= _HORIZON:
+            raise ValueError(f"--frames {size}: choose thousands, or {_HORIZON + 1} more at least")
     # Embeddings twice (exact, faiss), the index's copy, and what joining takes; half a KB a frame
     # for numbers and digests.
     needed, free = max(frames) * (16 * dims + 512), psutil.virtual_memory().available

@@ -78,6 +78,7 @@ def test_kinds_of_index(capsys):
         (["memory", "--frames", "1000000"], "need 6.7 GB and 1.0 are free: choose fewer frames"),
         (["index", "--frames", "1000000"], "need 6.7 GB and 1.0 are free"),
         (["memory", "--frames", "9"], "--frames 9: choose 50 to 16000000"),
+        (["memory", "--frames", "1004"], "--frames 1004: choose thousands, or 5 more at least"),
         (["memory", "--dims", "0"], "--dims 0: at least 1 is needed"),
         (["memory", "--frames", "60", "--plot", "x.png"], "--plot x.png: name at least two"),
         (["index", "--plot", "x.png"], "the table 'index' has no option --plot"),
