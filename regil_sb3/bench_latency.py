@@ -145,15 +145,17 @@ class _Given:
 
     def __init__(self, encoder: Encoder, length: int, blocks: int, steps: int) -> None:
         seen = _scene(length)
-        noise = np.random.default_rng(0).normal(scale=_NOISE, size=seen.shape)
-        self._episode = (seen + noise).round().clip(0, 255).astype(np.uint8)
+        rng = np.random.default_rng(0)
+        self._episode = np.empty_like(seen)
+        for noisy, picture in zip(self._episode, seen, strict=True):
+            noisy[:] = (picture + rng.normal(scale=_NOISE, size=picture.shape)).clip(0, 255)
         self._blocks = blocks
         self.retriever = Retriever(Demonstration(seen), encoder, k=_K, horizon=_HORIZON)
         self.memory = self.retriever.embeddings
         self.windows, self.costs = [], []
         for block in range(blocks):
-            pictures = [self.picture(block, i) for i in range(-_HORIZON, steps)]
-            rows = np.concatenate([encoder.encode(picture[None]) for picture in pictures])
+            pictures = [self.picture(block, i)[None] for i in range(-_HORIZON, steps)]
+            rows = np.concatenate([encoder.encode(picture) for picture in pictures])
             apart = squared_distances(rows, self.memory)
             self.windows.append([rows[i : i + _HORIZON + 1] for i in range(steps)])
             self.costs.append([apart[i : i + _HORIZON + 1] for i in range(steps)])
