@@ -42,7 +42,7 @@ def test_all_find_the_same_segment():
 
 
 def test_every_side_of_every_length_is_a_row():
-    rows = list(bench_latency.latency(["pixels?size=6"], [9, 40], blocks=3, steps=4))
+    rows = list(bench_latency.latency(["pixels?size=6"], [9, 40], 3, 4, seconds=1e9))
     names = [*OURS[:3], *(peer.name for peer in PEERS), OURS[3], LIBROSA_ON_COSTS.name]
     assert [(row.frames, row.what) for row in rows] == [(n, w) for n in (9, 40) for w in names]
     for row in rows:
@@ -50,8 +50,9 @@ def test_every_side_of_every_length_is_a_row():
         assert 0 < row.total <= row.p99
         assert np.isnan(row.encode) == (row.what not in OURS[:3])
         assert np.isnan(row.ratio) == (row.what in (OURS[0], OURS[1], OURS[3]))
-    one = rows[0]
-    assert 0 < one.encode + one.search + one.alignment < 2 * one.total
+    for row in rows[:3]:  # each part is at most the whole, call by call, and so are medians
+        assert min(row.encode, row.search, row.alignment) > 0
+        assert max(row.encode, row.search, row.alignment) <= row.total
 
 
 def test_ratios_are_of_what_they_are_compared_with(monkeypatch):

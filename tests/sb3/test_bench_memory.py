@@ -29,7 +29,8 @@ def test_both_searches_of_a_small_memory_agree():
     assert near.recall > 0.9
     assert near.same > 0.9
     for row in (exact, near):
-        assert 0 < row.found + row.aligned < 2 * row.step
+        assert 0 < row.found <= row.step + 1e-3  # parts are rounded
+        assert 0 < row.aligned <= row.step + 1e-3
         assert row.step <= row.p99
 
 
