@@ -15,32 +15,37 @@ grow with the shorter side of the picture.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from regil_wrappers.conditions import camera_shift, match_colours
+from regil_wrappers.matching import (
+    DIFFERENT,
+    TRUNCATION,
+    Floats,
+    Picture,
+    Point,
+    blurred,
+    both_ways,
+    check_pictures,
+    comparable,
+    error,
+    moved_by,
+    refine,
+    square,
+    warped,
+)
 
 __all__ = ["Displacement", "local_shift", "moved_back", "register"]
 
-Picture = NDArray[np.uint8]
-Floats = NDArray[np.float32]
-Point = NDArray[np.float64]
-
-_DIFFERENT = 25.0  # of 255: a pixel that differs by more in some channel has changed
-_TRUNCATION = 76.5  # of 255: an error counts no more than this, so that what is hidden costs little
-_SMALLEST = 12  # changed pixels at 84 pixels; fewer: nothing has moved
-_SPECK = 4  # connected changed pixels at 84 pixels; fewer are noise
 _HULL_WEIGHT = 0.2  # of the unchanged pixels between changed ones
 _COARSE = 42  # side of the pictures of the coarse search
 _REACH = 14  # how far it looks, in pixels of these
 _PULL = 0.51  # error (of 255) that a pixel of coarse shift must save
 _GROWTHS = (0.88, 1.0, 1.12)
-_MOST_GROWTH = (0.75, 1.35)
 
 
 @dataclass(frozen=True)
@@ -84,52 +89,40 @@ def register(reference: Picture, picture: Picture) -> Displacement | None:
     Raises:
         ValueError: if the pictures differ in shape or are not uint8 (H, W, 3).
     """
-    _check(reference, picture)
-    unit = min(picture.shape[:2]) / 84
-    camera = camera_shift(reference, picture)
-    seen_by_both = None
-    if camera.any():
-        matrix = np.array([[1, 0, camera[0]], [0, 1, camera[1]]])
-        inside = np.ones(picture.shape[:2], np.uint8)
-        size = (picture.shape[1], picture.shape[0])
-        inside = np.asarray(cv2.warpAffine(inside, matrix, size, flags=cv2.INTER_NEAREST))
-        seen_by_both = inside.astype(np.uint8)
-        reference = _warped(reference, matrix, inverse=False)
-    a, b = reference.astype(np.float32), match_colours(reference, picture)
-    share = float((np.abs(a - b).max(axis=2) > _DIFFERENT).mean())
+    pair = comparable(reference, picture)
+    a, b, unit, camera = pair.a, pair.b, pair.unit, pair.camera
     turned = (float(camera[0]), float(camera[1]))
-    found = _changed(a, b, unit, seen_by_both)
-    if found is None:
+    changed, hull = pair.changed, pair.hull
+    if changed is None or hull is None:
         if not camera.any():
             return None
         middle = ((picture.shape[1] - 1) / 2, (picture.shape[0] - 1) / 2)
-        return Displacement(middle, (0.0, 0.0), 1.0, 0.0, share, turned)
-    changed, hull = found
-    weights = np.maximum(cv2.dilate(changed, _square(3, unit)), hull * _HULL_WEIGHT)
+        return Displacement(middle, (0.0, 0.0), 1.0, 0.0, pair.share, turned)
+    weights = np.maximum(cv2.dilate(changed, square(3, unit)), hull * _HULL_WEIGHT)
     shift, growth = _coarse(a, b, weights, unit)
 
     ys, xs = np.nonzero(hull)
     centre = np.array([xs.min() + xs.max(), ys.min() + ys.max()]) / 2
-    smooth_a, smooth_b = _blurred(a, 0.8 * unit), _blurred(b, 0.8 * unit)
+    smooth_a, smooth_b = blurred(a, 0.8 * unit), blurred(b, 0.8 * unit)
     before, after = weights, weights
     seen = changed
     for _ in range(3):
-        shift, growth = _refine(smooth_a, smooth_b, before, after, centre, shift, growth, unit)
-        there, here = _both_ways(a, b, centre, shift, growth)
+        shift, growth = refine(smooth_a, smooth_b, before, after, centre, shift, growth, unit)
+        there, here = both_ways(a, b, centre, shift, growth)
         explained = [
-            changed * (np.abs(x - y).mean(axis=2) < _DIFFERENT) for x, y in ((there, a), (here, b))
+            changed * (np.abs(x - y).mean(axis=2) < DIFFERENT) for x, y in ((there, a), (here, b))
         ]
         if min(x.sum() for x in explained) < 8 * unit**2:
             break
         seen = explained[0]
         before, after = (
             cv2.morphologyEx(
-                cv2.dilate(x, _square(3, unit)), cv2.MORPH_CLOSE, _square(5, unit)
+                cv2.dilate(x, square(3, unit)), cv2.MORPH_CLOSE, square(5, unit)
             ).astype(np.float32)
             for x in explained
         )
-    left = _error(a, b, weights, weights, centre, shift, growth)
-    still = _error(a, b, weights, weights, centre, np.zeros(2), 1.0)
+    left = error(a, b, weights, weights, centre, shift, growth)
+    still = error(a, b, weights, weights, centre, np.zeros(2), 1.0)
     ys, xs = np.nonzero(seen)
     point = np.array([xs.mean(), ys.mean()])
     moved = centre + shift + growth * (point - centre) - point
@@ -138,7 +131,7 @@ def register(reference: Picture, picture: Picture) -> Displacement | None:
         shift=(float(moved[0]), float(moved[1])),
         growth=float(growth),
         ratio=left / max(still, 1e-9),
-        changed=share,
+        changed=pair.share,
         camera=turned,
     )
 
@@ -158,7 +151,7 @@ def moved_back(picture: Picture, displacement: Displacement | None) -> Picture:
     if displacement is None:
         return picture
     x, y = np.add(displacement.shift, displacement.camera)
-    return _warped(picture, np.array([[1, 0, x], [0, 1, y]]), inverse=True)
+    return warped(picture, moved_by((x, y)), inverse=True)
 
 
 def local_shift(before: Picture, after: Picture, point: Point, radius: float = 8.0) -> Point:
@@ -176,52 +169,33 @@ def local_shift(before: Picture, after: Picture, point: Point, radius: float = 8
     Raises:
         ValueError: if the pictures differ in shape or are not uint8 (H, W, 3).
     """
-    _check(before, after)
+    check_pictures(before, after)
     a, b = before.astype(np.float32), after.astype(np.float32)
     unit = min(a.shape[:2]) / 84
-    changed = (np.abs(a - b).max(axis=2) > _DIFFERENT).astype(np.uint8)
-    weights = cv2.dilate(changed, _square(3, unit)) * _gaussian(a, point, radius * unit)
+    changed = (np.abs(a - b).max(axis=2) > DIFFERENT).astype(np.uint8)
+    weights = cv2.dilate(changed, square(3, unit)) * _gaussian(a, point, radius * unit)
     if weights.sum() < 3 * unit**2:
         return np.zeros(2)
-    a, b = _blurred(a, unit), _blurred(b, unit)
+    a, b = blurred(a, unit), blurred(b, unit)
 
-    def error(shift: Point) -> float:
-        return _error(a, b, weights, weights, point, shift, 1.0, truncation=60.0)
+    def cost(shift: Point) -> float:
+        return error(a, b, weights, weights, point, shift, 1.0, truncation=60.0)
 
     grid = np.arange(-8, 9, 2) * unit
-    shift = min((np.array([x, y]) for y in grid for x in grid), key=error)
-    least = error(shift)
+    shift = min((np.array([x, y]) for y in grid for x in grid), key=cost)
+    least = cost(shift)
     for step in (1.0, 0.5, 0.25, 0.12, 0.06):
         for _ in range(6):
             near = [shift + step * unit * np.array(d) for d in _EIGHT]
-            errors = [error(x) for x in near]
-            best = int(np.argmin(errors))
-            if errors[best] >= least - 1e-6:
+            costs = [cost(x) for x in near]
+            best = int(np.argmin(costs))
+            if costs[best] >= least - 1e-6:
                 break
-            least, shift = errors[best], near[best]
+            least, shift = costs[best], near[best]
     return shift
 
 
-_FOUR = ((1, 0), (-1, 0), (0, 1), (0, -1))
-_EIGHT = (*_FOUR, (1, 1), (-1, -1), (1, -1), (-1, 1))
-
-
-def _check(a: Picture, b: Picture) -> None:
-    for x in (a, b):
-        if x.dtype != np.uint8 or x.ndim != 3 or x.shape[2] != 3 or x.shape != a.shape:
-            raise ValueError(
-                f"pictures are {a.dtype} {a.shape} and {b.dtype} {b.shape}: give two of one shape, "
-                f"uint8 (H, W, 3)"
-            )
-
-
-def _blurred(picture: Floats, std: float) -> Floats:
-    return cast("Floats", cv2.GaussianBlur(picture, (0, 0), std))
-
-
-def _square(side: float, unit: float) -> NDArray[np.uint8]:
-    n = max(1, round(side * unit)) | 1
-    return np.ones((n, n), np.uint8)
+_EIGHT = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
 
 def _gaussian(picture: Floats, point: Point, radius: float) -> Floats:
@@ -229,84 +203,6 @@ def _gaussian(picture: Floats, point: Point, radius: float) -> Floats:
     squared = (x - point[0]) ** 2 + (y - point[1]) ** 2
     weights: Floats = np.exp(-squared / (2 * radius**2)).astype(np.float32)
     return weights
-
-
-def _changed(
-    a: Floats, b: Floats, unit: float, seen_by_both: NDArray[np.uint8] | None
-) -> tuple[Floats, Floats] | None:
-    """Pixels that differ, and their convex hull, a little larger; None where too few do.
-
-    Where the camera has moved (``seen_by_both``: what both pictures show), edges cannot be brought
-    to lie exactly on each other: there a thing counts only if some of its pixels differ from
-    everything within a pixel of them.
-    """
-    changed = (np.abs(a - b).max(axis=2) > _DIFFERENT).astype(np.uint8)
-    core = changed
-    if seen_by_both is not None:
-        near = _square(3, unit)
-        beyond = np.maximum(
-            np.maximum(b - cv2.dilate(a, near), cv2.erode(a, near) - b),
-            np.maximum(a - cv2.dilate(b, near), cv2.erode(b, near) - a),
-        )
-        changed *= seen_by_both
-        core = changed * (beyond.max(axis=2) > _DIFFERENT)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)
-    small = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] < _SPECK * unit**2)
-    core[np.isin(labels, small)] = 0
-    if core.sum() < _SMALLEST * unit**2:
-        return None
-    if seen_by_both is not None:
-        core = cv2.dilate(core, _square(3, unit)).astype(np.uint8) * changed
-    hull = np.zeros_like(core)
-    points = cast("NDArray[np.int32]", cv2.findNonZero(core))
-    cv2.fillConvexPoly(hull, cv2.convexHull(points), (1,))
-    return core.astype(np.float32), cv2.dilate(hull, _square(5, unit)).astype(np.float32)
-
-
-def _matrix(centre: Point, shift: Point, growth: float) -> NDArray[np.float64]:
-    offset = centre + shift - growth * centre
-    return np.array([[growth, 0, offset[0]], [0, growth, offset[1]]])
-
-
-def _warped(picture: NDArray[Any], matrix: NDArray[np.float64], inverse: bool) -> NDArray[Any]:
-    flags = cv2.INTER_LINEAR | (cv2.WARP_INVERSE_MAP if inverse else 0)
-    size = (picture.shape[1], picture.shape[0])
-    return cast(
-        "NDArray[Any]",
-        cv2.warpAffine(picture, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE),
-    )
-
-
-def _both_ways(
-    a: Floats, b: Floats, centre: Point, shift: Point, growth: float
-) -> tuple[Floats, Floats]:
-    """The second picture moved back, and the first moved forward."""
-    matrix = _matrix(centre, shift, growth)
-    return _warped(b, matrix, inverse=True), _warped(a, matrix, inverse=False)
-
-
-def _truncated(a: Floats, b: Floats, weights: Floats, truncation: float) -> float:
-    e = cv2.transform(cv2.absdiff(a, b), _MEAN)
-    np.minimum(e, truncation, out=e)
-    return float(cv2.multiply(e, weights).sum() / max(float(weights.sum()), 1e-6))
-
-
-_MEAN = np.full((1, 3), 1 / 3, np.float32)
-
-
-def _error(
-    a: Floats,
-    b: Floats,
-    before: Floats,
-    after: Floats,
-    centre: Point,
-    shift: Point,
-    growth: float,
-    truncation: float = _TRUNCATION,
-) -> float:
-    """Mean truncated difference of the pictures, on weighted pixels of the first and second."""
-    back, forward = _both_ways(a, b, centre, shift, growth)
-    return _truncated(back, a, before, truncation) + _truncated(forward, b, after, truncation)
 
 
 def _coarse(a: Floats, b: Floats, weights: Floats, unit: float) -> tuple[Point, float]:
@@ -322,7 +218,7 @@ def _coarse(a: Floats, b: Floats, weights: Floats, unit: float) -> tuple[Point, 
     shifts = np.arange(-_REACH, _REACH + 1)
     best = (np.inf, np.zeros(2), 1.0)
     for growth in _GROWTHS:
-        there, here = (_padded(x, pad) for x in _both_ways(a, b, centre, np.zeros(2), growth))
+        there, here = (_padded(x, pad) for x in both_ways(a, b, centre, np.zeros(2), growth))
         # In the second picture moved back, a shift is divided by the growth.
         back = np.clip(np.round(shifts / growth).astype(int), -pad, pad)
         for dy, back_y in zip(shifts, back, strict=True):
@@ -359,35 +255,5 @@ def _row_errors(
     windows = np.stack([band[:, pad + dx + columns.start : pad + dx + columns.stop] for dx in dxs])
     windows -= patch
     np.abs(windows, out=windows)
-    errors = np.minimum(windows.mean(axis=3), _TRUNCATION)
+    errors = np.minimum(windows.mean(axis=3), TRUNCATION)
     return cast("NDArray[np.float64]", np.einsum("nhw,hw->n", errors, weights).astype(float))
-
-
-def _refine(
-    a: Floats,
-    b: Floats,
-    before: Floats,
-    after: Floats,
-    centre: Point,
-    shift: Point,
-    growth: float,
-    unit: float,
-) -> tuple[Point, float]:
-    """Coordinate descent on shift and growth with ever smaller steps."""
-
-    def error(shift: Point, growth: float) -> float:
-        if not _MOST_GROWTH[0] < growth < _MOST_GROWTH[1]:
-            return math.inf
-        return _error(a, b, before, after, centre, shift, growth) + 3 * abs(math.log(growth))
-
-    least = error(shift, growth)
-    for step, ratio in ((1.0, 1.04), (0.5, 1.02), (0.25, 1.01), (0.1, 1.005)):
-        for _ in range(8):
-            near = [(shift + step * unit * np.array(d), growth) for d in _FOUR]
-            near += [(shift, growth * ratio), (shift, growth / ratio)]
-            errors = [error(*x) for x in near]
-            best = int(np.argmin(errors))
-            if errors[best] >= least - 1e-6:
-                break
-            least, (shift, growth) = errors[best], near[best]
-    return shift, growth
