@@ -114,7 +114,8 @@ class Guided:
         plain: whether plain replay succeeded, goal by goal.
         corrected: whether corrected replay did, at the same goals.
         errors_cm: how far the believed place of the target is from the true one, in the table's
-            plane; only of episodes in which a correction was tried.
+            plane, and that of where it is brought, where the task moves it too; only of episodes in
+            which a correction was tried.
         seconds: spent in the guide (encoder, retrieval and registration too), an episode.
         calibration_steps: that calibration took, before these episodes.
         said: what the guide said of itself, where it gave up correcting.
@@ -189,7 +190,7 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     goals = range(EVALUATION_SEEDS, EVALUATION_SEEDS + n)
     reference = gym.make(f"regil/metaworld-{task}-v0")
     reference.reset(seed=int(demo.metadata["seed"]))
-    home = _target(reference)
+    home = _places(reference)
     reference.close()
 
     plain = RetrievalGuideWrapper(_make(task, disturbance), demo)
@@ -206,11 +207,9 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     corrected, errors = [], []
     for goal in goals:
         corrected.append(_play(env, goal))
-        shift = env.target_shift
-        if shift is not None:
-            repeat = env.unwrapped.metadata["regil"]["action_repeat"]  # 1 cm each
-            off = shift * repeat - 100 * (_target(env) - home)
-            errors.append(float(np.linalg.norm(off[:2])))
+        repeat = env.unwrapped.metadata["regil"]["action_repeat"]  # 1 cm each
+        for shift, moved in zip(_believed(env), _places(env) - home, strict=False):
+            errors.append(float(np.linalg.norm((shift * repeat - 100 * moved)[:2])))
     seconds = time.perf_counter() - start - timed.seconds
     said = (env.calibration() or {}).get("why", "")
     env.close()
@@ -219,10 +218,16 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     )
 
 
-def _target(env: gym.Env[Any, Any]) -> npt.NDArray[np.float64]:
-    """(3,) m: the place of what Meta-World's tasks move about, from the simulator."""
+def _places(env: gym.Env[Any, Any]) -> npt.NDArray[np.float64]:
+    """(1 or 2, 3) m: the places of what Meta-World's tasks move about, from the simulator."""
     vector = env.unwrapped._sim._last_rand_vec  # type: ignore[attr-defined]
-    return np.array(vector[-3:], float)
+    return np.array(vector, float).reshape(-1, 3)
+
+
+def _believed(env: RetrievalGuideWrapper[Any, Any]) -> list[npt.NDArray[np.float64]]:
+    """[(3,), (3,)] action units: how far the first and the second are believed to have moved."""
+    shifts = (env.target_shift, env.place_shift)
+    return [shift for shift in shifts if shift is not None]
 
 
 def _play(env: RetrievalGuideWrapper[Any, Any], seed: int) -> bool:

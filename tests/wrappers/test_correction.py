@@ -156,6 +156,40 @@ def test_the_release_is_learned(carried: Demonstration) -> None:
     assert ways["corrected"][1] > ways["corrected"][0] - 4
 
 
+def test_two_things_that_moved_apart() -> None:
+    """Square and goal go their own ways: no single displacement brings the one to the other."""
+    brought = toy_camera.record(task="bring")
+    env = calibrated(guided(brought, task="bring"))
+    known = env.calibration()
+    results: dict[str, list[bool]] = {"corrected": [], "released": [], "plain": []}
+    for seed in range(10):
+        infos = play(env, seed)
+        results[infos[0]["retrieval"]["guide"]].append(infos[-1]["is_success"])
+        if infos[0]["retrieval"]["guide"] == "released" and env._servo.place_shift.any():
+            env.reset(seed=seed)
+            moved = env.unwrapped.goal - toy_camera.GOAL
+            env._servo.reset(env.displacement, env.apart(env._servo.grasp), kind="released")
+            assert np.linalg.norm((env.target_shift - (env.unwrapped.square - HOME))[:2]) < 0.6
+            assert np.linalg.norm((env.place_shift - moved)[:2]) < 1.6
+    # pictures say so from the first episode on
+    assert len(results["released"]) >= 6
+    assert np.mean(results["released"]) >= 0.9
+
+    env.set_calibration(known)
+    blind = [_without_apart(env, seed, kind) for kind in results for seed in range(3)]
+    assert not any(blind)
+
+
+def _without_apart(env: Any, seed: int, kind: str) -> bool:
+    env.reset(seed=seed)
+    env._servo.reset(env.displacement, kind=kind)
+    over = False
+    while not over:
+        *_, terminated, truncated, info = env.step(env.guide_action())
+        over = terminated or truncated
+    return bool(info["is_success"])
+
+
 def test_it_gives_way_to_plain_replay_by_its_own_evidence(demo: Demonstration) -> None:
     """Only the picture of the square moves: who follows it fails."""
     env = calibrated(guided(demo, decoy=True))

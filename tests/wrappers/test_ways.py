@@ -38,6 +38,17 @@ def test_the_best_is_found_and_kept(share: dict[str, float], best: str) -> None:
     assert first.count("corrected") > first.count("released") > first.count("plain") > 0
 
 
+def test_pictures_of_two_things_speak_for_the_release() -> None:
+    def kinds(ways: Ways, apart: bool) -> list[str]:
+        return [ways.choose(np.random.default_rng(seed), apart).kind for seed in range(100)]
+
+    ways = Ways([1], grasps=True)
+    assert kinds(ways, True).count("released") >= 70 > 50 >= kinds(ways, False).count("released")
+    ways.best("released").lost += 10  # but successes overrule them
+    ways.best("corrected").won += 10
+    assert kinds(ways, True).count("corrected") >= 70
+
+
 def test_a_mirror_sign_is_chosen_by_success() -> None:
     ways, rng = Ways([-1, 1], grasps=False), np.random.default_rng(0)
     chosen = []

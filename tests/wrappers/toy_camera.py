@@ -13,7 +13,7 @@ SIZE = 84
 FOCAL = 88.0  # px
 EYE, LOOK_AT = np.array([0.0, -58.0, 40.0]), np.array([0.0, 4.0, -6.0])
 HOME = np.array([2.0, 4.0, -22.0])  # where the square stands in the demonstration
-GOAL = np.array([-9.0, 12.0, -6.0])  # of "carry": it does not move
+GOAL = np.array([-9.0, 12.0, -6.0])  # of "carry", where it does not move, and "bring"
 SPREAD = 9.0  # how far the square moves along each axis of the table
 NEAR = 1.2
 
@@ -25,7 +25,7 @@ def _textured(side: int, seed: int) -> np.ndarray:
 
 _TABLE = cv2.resize(_textured(96, 9)[:12, :12], (SIZE + 40, SIZE + 40)) * 0.4 + 80
 _FIXED = _textured(24, 7)
-_SQUARE, _HAND = _textured(16, 3), _textured(20, 4)
+_SQUARE, _HAND, _PLACE = _textured(16, 3), _textured(20, 4), _textured(20, 11)
 _FINGERS = {False: np.full((8, 8, 3), 250, np.float32), True: np.full((8, 8, 3), 5, np.float32)}
 
 
@@ -54,6 +54,8 @@ def _draw(
 
 class ToyCamera(gym.Env[Any, np.ndarray]):
     """Actions are deltas (dx right, dy away, dz up, gripper); the square moves on the table.
+
+    Tasks: "touch" the square, "carry" it to a goal, or "bring" it to one that is seen and moves.
 
     `decoy`: only the picture of the square moves, what has to be touched does not. `dead`: a
     dimension that does nothing. `absolute`: actions are places. `look`: "mirrored" left to right.
@@ -106,6 +108,8 @@ class ToyCamera(gym.Env[Any, np.ndarray]):
         x, y = 20 - np.asarray(self.pan, float)
         picture = cv2.warpAffine(_TABLE, np.array([[1, 0, -x], [0, 1, -y]]), (SIZE, SIZE))
         picture = _draw(picture, _FIXED, (-20, 30, -22), 8, self.pan, self.distance)
+        if self.task == "bring":
+            picture = _draw(picture, _PLACE, self.goal, 9, self.pan, self.distance)
         picture = _draw(picture, _SQUARE, self.square, 9, self.pan, self.distance)
         picture = _draw(picture, _HAND, self.hand + np.array([0, 0, 3]), 7, self.pan, self.distance)
         picture = _draw(picture, _FINGERS[self.closed], self.hand, 4, self.pan, self.distance)
@@ -120,8 +124,8 @@ class ToyCamera(gym.Env[Any, np.ndarray]):
 
     def expert_action(self) -> np.ndarray:
         to = self.square - self.hand
-        if self.task == "carry" and (np.abs(to).max() < 0.2 or self.held):
-            return np.array([*np.clip(GOAL - self.hand, -0.8, 0.8) * self.held, 1], np.float32)
+        if self.task != "touch" and (np.abs(to).max() < 0.2 or self.held):
+            return np.array([*np.clip(self.goal - self.hand, -0.8, 0.8) * self.held, 1], np.float32)
         return np.array([*np.clip(to, -0.8, 0.8), -1], np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -130,6 +134,9 @@ class ToyCamera(gym.Env[Any, np.ndarray]):
         self.square = HOME.copy()
         if not self.frozen:
             self.square += self.axes * self.np_random.uniform(-1, 1, 3)
+        self.goal = GOAL.copy()
+        if self.task == "bring" and not self.frozen:
+            self.goal += self.axes * self.np_random.uniform(-1, 1, 3)
         self.closed = self.held = False
         self.steps = 0
         return self._observe(), {}
@@ -142,10 +149,10 @@ class ToyCamera(gym.Env[Any, np.ndarray]):
         self.closed = bool(action[3] > 0)
         wanted = HOME if self.decoy else self.square
         self.held = self.closed and (self.held or bool(np.abs(self.hand - wanted).max() < NEAR))
-        if self.task == "carry":
+        if self.task != "touch":
             if self.held:
                 self.square = self.hand.copy()
-            success = bool(self.held and np.abs(self.hand - GOAL).max() < NEAR)
+            success = bool(self.held and np.abs(self.hand - self.goal).max() < NEAR)
         else:
             success = bool(np.abs(self.hand - wanted).max() < NEAR)
         self.steps += 1

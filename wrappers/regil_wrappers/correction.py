@@ -5,7 +5,8 @@
   demonstrated path shifted by that much
 
 It is given pictures and says actions. It assumes a fixed camera, an arm that starts each episode in
-the same pose, translations that are deltas, and one target that moved.
+the same pose, translations that are deltas, and one target that moved; or two, where a gripper
+takes up the one and brings it to the other.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from regil_wrappers.apart import Apart
 from regil_wrappers.calibration import Calibration
+from regil_wrappers.declared import check_gripper, checked_dims, checked_plane
+from regil_wrappers.path import Path
 from regil_wrappers.pinhole import Pinhole, nearest_to_path, solve_displacement
 from regil_wrappers.registration import Displacement
 from regil_wrappers.ways import Way, Ways
@@ -29,11 +33,9 @@ Picture = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 Mirror = Literal["auto", 1, -1]
 
-_RAMP = 0.15  # of the demonstration: the share in which the correction grows to its full size
 _REACHED = 0.3  # of a full action: a place of the path counts as reached
 _AHEAD = 10  # places ahead of the next that may be reached before it
 _SETTLE = 0.1  # s that a calibration move is given to come to rest
-_RELEASE = (10, 12)  # steps after the gripper closes: the correction starts to fade; fades over
 _WORST_RATIO = 0.95  # a registration that explains less is not believed
 _KICK_EVERY = 10  # steps of a disturbed episode, on average
 _DISTURBED = 0.5  # of a full action: a replay that was disturbed by no more is a replay
@@ -84,31 +86,19 @@ class Servo:
         disturbance: float = 0.0,
         seed: int | None = None,
     ) -> None:
-        self._dims = _checked_dims(list(translation_dims), low, high)
-        self._plane = np.array(list(plane), float)
-        if self._plane.shape != (3,) or not ((self._plane > 0) & (self._plane < np.inf)).all():
-            raise ValueError(
-                f"plane={list(plane)}: give three positive standard deviations, in action units"
-            )
-        if gripper_dim is not None and not (
-            0 <= gripper_dim < len(low) and gripper_dim not in self._dims
-        ):
-            raise ValueError(
-                f"gripper_dim={gripper_dim}: it must be a dimension of the actions that is not "
-                f"one of translation_dims={self._dims}"
-            )
+        self._dims = checked_dims(translation_dims, low, high)
+        self._plane = checked_plane(plane)
+        check_gripper(gripper_dim, self._dims, len(low))
         if mirror not in ("auto", 1, -1):
             raise ValueError(f"mirror={mirror!r}: choose 'auto', 1 or -1")
         self._size = size
-        self._unit = min(size) / 84
         self._actions = actions
         self._gripper = gripper_dim
         self._disturbance = disturbance
         self._disturbs = False
         self._limit = np.minimum(-low, high)[self._dims].astype(float)
         deltas = np.clip(actions[:, self._dims].astype(float), -self._limit, self._limit)
-        self._path = np.cumsum(deltas, axis=0)
-        self._last_delta = deltas[-1]
+        self._path = Path(deltas, None if gripper_dim is None else actions[:, gripper_dim])
         self._mirrors = (1, -1) if mirror == "auto" else (mirror,)
         self._rng = np.random.default_rng(seed)
         self._low, self._high = low, high
@@ -124,7 +114,7 @@ class Servo:
             max(2, math.ceil(_SETTLE * (control_rate or 40.0))),
         )
         self.cameras: dict[int, Pinhole] = {}
-        self._ways = Ways((), self._grasp() is not None)
+        self._ways = Ways((), self.grasp is not None)
         self.why = ""  # why replay is plain, where it is
         self._off_plane = 0
         self._begin_episode()
@@ -136,8 +126,14 @@ class Servo:
         """Whether calibration is over, so that `reset` can use a displacement."""
         return self._calibration is None
 
+    @property
+    def grasp(self) -> int | None:
+        """The step in which the demonstration's open gripper closes; None where none does."""
+        return self._path.grasp
+
     # Of an episode
     target_shift: Floats  # action units: where the target is believed to have gone
+    place_shift: Floats  # action units: where what is taken up is to be brought has gone
     _way: Way
     _moving: bool  # calibration moves are under way
     _calibrated_here: bool
@@ -146,12 +142,18 @@ class Servo:
     _hand: Floats  # (3,) action units from the start
     _kick: Floats  # (3,) action units that the hand is still to be pushed
 
-    def reset(self, displacement: Displacement | None = None, kind: str | None = None) -> None:
+    def reset(
+        self,
+        displacement: Displacement | None = None,
+        apart: Apart | None = None,
+        kind: str | None = None,
+    ) -> None:
         """Begin an episode.
 
         Args:
             displacement: what `registration.register` found between the demonstration's first
                 picture and this episode's; not used before `calibrated`.
+            apart: what `apart.register_apart` found, where there is a `grasp`; likewise.
             kind: "corrected", "released" or "plain" in place of a choice between them.
         """
         self._begin_episode()
@@ -159,7 +161,7 @@ class Servo:
             self._moving = True
             self._calibration.begin()
         else:
-            self._begin_replay(displacement, kind)
+            self._begin_replay(displacement, apart, kind)
 
     def disturbed(self) -> NDArray[np.float32] | None:
         """What to execute now where `action` is what to learn; None where they are the same."""
@@ -232,7 +234,7 @@ class Servo:
         Nothing is skipped that the gripper does on the way.
         """
         for i in range(self._at, min(self._at + _AHEAD, len(self._path))):
-            if self._gripper is not None and np.ptp(self._actions[self._at : i + 1, self._gripper]):
+            if self._path.gripper_moves(self._at, i):
                 break
             if self._near(i):
                 return i + 1
@@ -290,8 +292,12 @@ class Servo:
 
     # -- replaying -------------------------------------------------------------------------------
 
-    def _begin_replay(self, found: Displacement | None, kind: str | None) -> None:
-        self._way = self._ways.choose(self._rng) if kind is None else self._ways.best(kind)
+    def _begin_replay(
+        self, found: Displacement | None, apart: Apart | None, kind: str | None
+    ) -> None:
+        seen = apart if apart is not None and apart.believed(_WORST_RATIO) else None
+        chosen = self._ways.choose(self._rng, seen is not None) if kind is None else None
+        self._way = chosen or self._ways.best(str(kind))
         # Every other episode goes undisturbed, and tells which way of replaying is best
         self._disturbs = not self._disturbs and self._disturbance > 0
         if self._way.kind == "plain" or found is None:
@@ -304,7 +310,9 @@ class Servo:
                     "or scene are others; the guide replays without correction while that lasts"
                 )
             return
-        shift, misfit = self._solved(found)
+        if self._way.kind == "released" and seen is not None and self._believes(seen):
+            return
+        shift, misfit = self._solved(found, self._path.places)
         if found.ratio > _WORST_RATIO:
             self._way = self._ways.plain
         elif misfit > _MISFIT:
@@ -319,10 +327,23 @@ class Servo:
         else:
             self.target_shift = shift
 
-    def _solved(self, found: Displacement) -> tuple[Floats, float]:
+    def _believes(self, apart: Apart) -> bool:
+        """Take over what moved apart, unless the plane does not explain it."""
+        shifts = [np.zeros(3), np.zeros(3)]
+        for i, (found, path) in enumerate(
+            zip((apart.taken, apart.place), self._path.split(), strict=True)
+        ):
+            if found is not None:
+                shifts[i], misfit = self._solved(found, path)
+                if misfit > _MISFIT:
+                    return False
+        self.target_shift, self.place_shift = shifts
+        return True
+
+    def _solved(self, found: Displacement, path: Floats) -> tuple[Floats, float]:
         """The displacement in action units, and by how many standard deviations it is off."""
         camera = self.cameras[self._way.mirror]
-        place = nearest_to_path(camera, found.point, self._path)
+        place = nearest_to_path(camera, found.point, path)
         return solve_displacement(camera, place, found.shift, found.growth, self._plane)
 
     def _say(self, why: str) -> None:
@@ -331,19 +352,11 @@ class Servo:
 
     def _take_over(self, calibration: Calibration) -> None:
         self.cameras = calibration.cameras
-        self._ways = Ways(self.cameras, self._grasp() is not None)
+        self._ways = Ways(self.cameras, self.grasp is not None)
         self._calibration, self._moving = None, False
         self._way = self._ways.plain  # what is left of this episode
         if calibration.why:
             self._say(f"{calibration.why}; the guide replays without correction")
-
-    def _grasp(self) -> int | None:
-        """The step in which an open gripper closes; None where none does."""
-        if self._gripper is None:
-            return None
-        closing = self._actions[:, self._gripper] > 0
-        events = np.flatnonzero(closing[1:] & ~closing[:-1])
-        return int(events[0]) + 1 if len(events) else None
 
     def _begin_episode(self) -> None:
         self._moving = self._calibrated_here = False
@@ -352,7 +365,7 @@ class Servo:
         self._hand = np.zeros(3)
         self._kick = np.zeros(3)
         self._way = self._ways.plain
-        self.target_shift = np.zeros(3)
+        self.target_shift, self.place_shift = np.zeros(3), np.zeros(3)
 
     def _idle(self) -> NDArray[np.float32]:
         """The action that holds still, the gripper as the demonstration begins, or open."""
@@ -369,7 +382,7 @@ class Servo:
 
     def demonstrated_path(self) -> Floats:
         """(T, 3) action units: the places that the demonstration goes through."""
-        return np.array(self._path)
+        return np.array(self._path.places)
 
     def corrected_path(self) -> Floats:
         """(T, 3) action units: the places that this episode's replay goes through."""
@@ -379,28 +392,5 @@ class Servo:
         return self._place(self._at)
 
     def _place(self, i: int) -> Floats:
-        n = len(self._path)
-        beyond = max(0, i - n + 1)  # the last action goes on
-        weight = min(1.0, (i + 1) / (_RAMP * n))
-        grasp = self._grasp()
-        if self._way.kind == "released" and grasp is not None:
-            weight *= float(np.clip(1 - (i - grasp - _RELEASE[0]) / _RELEASE[1], 0, 1))
-        place = self._path[min(i, n - 1)] + beyond * self._last_delta
-        return cast("Floats", place + weight * self.target_shift)
-
-
-def _checked_dims(
-    dims: list[int], low: NDArray[np.float32], high: NDArray[np.float32]
-) -> list[int]:
-    if len(dims) != 3 or len(set(dims)) != 3 or not all(0 <= d < len(low) for d in dims):
-        raise ValueError(
-            f"translation_dims={dims}: name the three action dimensions (0 to {len(low) - 1}) "
-            "that move the hand"
-        )
-    for d in dims:
-        if not low[d] < 0 < high[d]:
-            raise ValueError(
-                f"translation_dims={dims}: dimension {d} takes [{low[d]:g}, {high[d]:g}], which "
-                "cannot be a delta: correction='servo' needs deltas"
-            )
-    return dims
+        brought = self.place_shift if self._way.kind == "released" else None
+        return self._path.corrected(i, self.target_shift, brought)

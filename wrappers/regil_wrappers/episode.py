@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from regil_wrappers.apart import Apart, register_apart, taken_up
 from regil_wrappers.frames import FrameSource
 from regil_wrappers.registration import Displacement, moved_back, register
 from regil_wrappers.retrieval import Retriever
@@ -35,6 +36,7 @@ class Episode:
         self.frames = frames
         self._moves_back = moves_back
         self._said_camera = False
+        self._taken: NDArray[np.bool_] | None = None
         self.begin()
 
     def begin(self) -> None:
@@ -93,3 +95,18 @@ class Episode:
                     stacklevel=2,
                 )
         return self._displacement
+
+    def apart(self, grasp: int) -> Apart:
+        """How far what the demonstration takes up has moved, and what else; found anew each time.
+
+        Args:
+            grasp: the step in which its gripper closes.
+
+        Raises:
+            ValueError: before the first picture.
+        """
+        if self._first is None:
+            raise ValueError("there is no picture yet: call reset() of the environment")
+        if self._taken is None:
+            self._taken = taken_up(self.frames.recorded, grasp)
+        return register_apart(self.frames.recorded_first, self._first, self._taken)

@@ -259,7 +259,9 @@ class Guides:
         for i, episode in self.episodes.begun.items():
             alignment = episode.retriever.alignment
             seed = None if seeds is None else seeds[i]
-            self.guides[i].begin(alignment, partial(getattr, episode, "displacement"), seed)
+            self.guides[i].begin(
+                alignment, partial(getattr, episode, "displacement"), episode.apart, seed
+            )
             said[i] = {**said_of(alignment), **self.guides[i].said()}
         return said
 

@@ -163,12 +163,15 @@ class FrameSource:
 
     @property
     def recorded_first(self) -> NDArray[np.uint8]:
-        """The demonstration's first picture of the kind that `picture` gives, (H, W, 3) uint8."""
+        """The first of `recorded`, (H, W, 3) uint8."""
+        return cast("NDArray[np.uint8]", self.recorded[0])
+
+    @property
+    def recorded(self) -> NDArray[np.uint8]:
+        """The demonstration's pictures of the kind that `picture` gives, (T, H, W, 3) uint8."""
         if self._encoder_size is not None:
-            frames = cast("NDArray[np.uint8]", self._demo.encoder_frames)
-        else:
-            frames = self._demo.frames
-        return cast("NDArray[np.uint8]", frames[0])
+            return cast("NDArray[np.uint8]", self._demo.encoder_frames)
+        return self._demo.frames
 
     def raw(self, observation: Any) -> Any:
         """What the current picture is made of, as the environment gives it.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from regil_wrappers.apart import Apart
 from regil_wrappers.correction import Servo
 from regil_wrappers.registration import Displacement
 from regil_wrappers.retrieval import Alignment
@@ -52,6 +53,7 @@ class Guide:
         self,
         alignment: Alignment,
         displacement: Callable[[], Displacement | None],
+        apart: Callable[[int], Apart],
         seed: int | None = None,
     ) -> None:
         """Begin an episode.
@@ -60,6 +62,8 @@ class Guide:
             alignment: of its first frame.
             displacement: says what has moved since the demonstration began; asked only where a
                 correction uses it.
+            apart: says the same of what the demonstration takes up, given the step in which it
+                does, and of what else moved; likewise.
             seed: of the correction's choices; None leaves their stream as it is.
         """
         self._alignment = alignment
@@ -68,7 +72,11 @@ class Guide:
         if self.servo is not None:
             if seed is not None:
                 self.servo.reseed(seed)
-            self.servo.reset(displacement() if self.servo.calibrated else None)
+            if not self.servo.calibrated:
+                self.servo.reset()
+                return
+            grasp = self.servo.grasp
+            self.servo.reset(displacement(), None if grasp is None else apart(grasp))
 
     def after(
         self,
@@ -141,6 +149,16 @@ class Guide:
         if self.servo is None or self.servo.kind not in ("corrected", "released"):
             return None
         return self.servo.target_shift
+
+    @property
+    def place_shift(self) -> NDArray[np.float64] | None:
+        """(3,) action units: the same of where the target is brought.
+
+        What `target_shift` is, unless the correction changes after a grasp.
+        """
+        if self.servo is None or self.servo.kind != "released":
+            return self.target_shift
+        return self.servo.place_shift
 
     def calibration(self) -> dict[str, Any] | None:
         """What a correction has learned about camera and task, as JSON values.

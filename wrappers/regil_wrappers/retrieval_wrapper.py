@@ -11,6 +11,7 @@ from gymnasium.core import ActType, ObsType
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
+from regil_wrappers.apart import Apart
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.demonstrations import (
     Demonstrations,
@@ -107,6 +108,16 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
         if self._frames is None:
             return cast("Displacement | None", self.env.get_wrapper_attr("displacement"))
         return self._episode.displacement
+
+    def apart(self, grasp: int) -> Apart:
+        """How far what the demonstration takes up has moved since it began, and what else.
+
+        Args:
+            grasp: the step in which its gripper closes.
+        """
+        if self._frames is None:
+            return cast("Apart", self.env.get_wrapper_attr("apart")(grasp))
+        return self._episode.apart(grasp)
 
     def _with_retrieval(self, info: dict[str, Any], **own: Any) -> dict[str, Any]:
         inner = info["retrieval"] if self._frames is None else {}

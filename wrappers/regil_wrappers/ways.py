@@ -17,6 +17,7 @@ __all__ = ["Way", "Ways"]
 # Successes and failures that each way of replaying starts with, Beta(a, b): what is usually best is
 # tried first, and given up when it fails.
 _PRIORS = {"corrected": (4.0, 1.0), "released": (2.0, 1.0), "plain": (1.0, 1.5)}
+_SEEN = 3.0  # episodes that weigh as much as pictures that show two things moved apart
 _ENOUGH = 6  # corrected episodes before plain replay is said to be better
 
 
@@ -25,7 +26,7 @@ class Way:
     """One way of replaying, and what came of it.
 
     Attributes:
-        kind: "corrected", "released" (no correction after a grasp) or "plain".
+        kind: "corrected", "released" (after a grasp, corrected for where it is brought) or "plain".
         mirror: sign of the camera that corrects.
         won: successes, those that it starts with included.
         lost: failures, likewise.
@@ -47,7 +48,8 @@ class Ways:
 
     Args:
         mirrors: signs of the cameras, the better fit first; none: plain replay alone.
-        grasps: whether the demonstration grasps something, so that a correction may be released.
+        grasps: whether the demonstration grasps something, so that what is brought may be released
+            from the correction of what is taken.
     """
 
     def __init__(self, mirrors: Iterable[int], grasps: bool) -> None:
@@ -55,9 +57,19 @@ class Ways:
         self.plain = Way("plain", 1, *_PRIORS["plain"])
         self.all = [Way(kind, m, *_PRIORS[kind]) for m in mirrors for kind in kinds] + [self.plain]
 
-    def choose(self, rng: np.random.Generator) -> Way:
-        """Draw each way's share of successes, and take the largest."""
-        draws = [rng.beta(way.won, way.lost) for way in self.all]
+    def choose(self, rng: np.random.Generator, apart: bool = False) -> Way:
+        """Draw each way's share of successes, and take the largest.
+
+        Args:
+            rng: draws.
+            apart: whether pictures show that more has moved than what is taken up, which speaks for
+                "released" and against "corrected", as a few episodes would.
+        """
+        speaks = {"released": (_SEEN, 0.0), "corrected": (0.0, _SEEN)} if apart else {}
+        draws = []
+        for way in self.all:
+            won, lost = speaks.get(way.kind, (0.0, 0.0))
+            draws.append(rng.beta(way.won + won, way.lost + lost))
         return self.all[int(np.argmax(draws))]
 
     def best(self, kind: str) -> Way:

@@ -41,9 +41,9 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
     With ``correction="servo"`` the suggested actions go where the target is now. The first episodes
     that follow the guide then begin with moves that show it how the camera sees the hand. From
     there on ``info["retrieval"]["guide"]`` says what it suggests: "calibration", "corrected",
-    "released" (no correction after a grasp) or "plain" (the demonstrator's own action), and
-    ``info["retrieval"]["calibrating"]`` whether this episode holds such moves: it demonstrates
-    nothing then.
+    "released" (after a grasp, corrected for where what is held is brought) or "plain" (the
+    demonstrator's own action), and ``info["retrieval"]["calibrating"]`` whether this episode holds
+    such moves: it demonstrates nothing then.
 
     Example:
         >>> import gymnasium as gym
@@ -195,7 +195,7 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
     ) -> tuple[ObsType, dict[str, Any]]:
         """Reset; ``info["retrieval"]`` holds the alignment and the first guide action."""
         observation, info = super().reset(seed=seed, options=options)
-        self._guide.begin(self.alignment, lambda: self.displacement, seed)
+        self._guide.begin(self.alignment, lambda: self.displacement, self.apart, seed)
         return observation, self._with_retrieval(info, **self._guide.said())
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -215,6 +215,14 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         Unknown without a correction, while it calibrates, and where it replays plainly.
         """
         return self._guide.target_shift
+
+    @property
+    def place_shift(self) -> NDArray[np.float64] | None:
+        """(3,) action units: where the place to which it brings that has gone, as it believes.
+
+        What `target_shift` is, unless the correction changes after a grasp.
+        """
+        return self._guide.place_shift
 
     def calibration(self) -> dict[str, Any] | None:
         """What a correcting guide has learned about camera and task, as JSON values.

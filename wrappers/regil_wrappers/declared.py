@@ -1,0 +1,65 @@
+"""What a user declares of an arm and its targets, checked.
+
+* ``checked_dims`` - the action dimensions that move the hand
+* ``checked_plane`` - how far targets move
+* ``check_gripper`` - the gripper's dimension
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["check_gripper", "checked_dims", "checked_plane"]
+
+
+def checked_dims(
+    translation_dims: Iterable[int], low: NDArray[np.float32], high: NDArray[np.float32]
+) -> list[int]:
+    """The three dimensions of actions within (A,) low and high that move the hand, as deltas.
+
+    Raises:
+        ValueError: if they are not three, do not exist or cannot be deltas.
+    """
+    dims = list(translation_dims)
+    if len(dims) != 3 or len(set(dims)) != 3 or not all(0 <= d < len(low) for d in dims):
+        raise ValueError(
+            f"translation_dims={dims}: name the three action dimensions (0 to {len(low) - 1}) "
+            "that move the hand"
+        )
+    for d in dims:
+        if not low[d] < 0 < high[d]:
+            raise ValueError(
+                f"translation_dims={dims}: dimension {d} takes [{low[d]:g}, {high[d]:g}], which "
+                "cannot be a delta: correction='servo' needs deltas"
+            )
+    return dims
+
+
+def checked_plane(plane: Iterable[float]) -> NDArray[np.float64]:
+    """(3,) action units, the standard deviations of displacements along each axis.
+
+    Raises:
+        ValueError: if they are not three positive numbers.
+    """
+    checked = np.array(list(plane), float)
+    if checked.shape != (3,) or not ((checked > 0) & (checked < np.inf)).all():
+        raise ValueError(
+            f"plane={list(plane)}: give three positive standard deviations, in action units"
+        )
+    return checked
+
+
+def check_gripper(gripper_dim: int | None, dims: Sequence[int], n: int) -> None:
+    """Refuse a gripper's dimension that is none of n, or moves the hand; None: no gripper.
+
+    Raises:
+        ValueError: naming what would be right.
+    """
+    if gripper_dim is not None and not (0 <= gripper_dim < n and gripper_dim not in dims):
+        raise ValueError(
+            f"gripper_dim={gripper_dim}: it must be a dimension of the actions that is not "
+            f"one of translation_dims={list(dims)}"
+        )
