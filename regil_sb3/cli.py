@@ -1,4 +1,4 @@
-"""The command line: ``regil record | convert | train | evaluate | report | bench``."""
+"""The command line: ``regil record | convert | doctor | train | evaluate | report | bench``."""
 
 from __future__ import annotations
 
@@ -58,6 +58,24 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument(
         "--held", type=int, nargs="+", default=[], metavar="DIM", help="that take the last: gripper"
     )
+
+    doctor = commands.add_parser(
+        "doctor",
+        help="say whether a demonstration can work in an environment",
+        epilog="exit status: 0 nothing is wrong (there may be warnings), 1 something is, "
+        "2 it could not be examined",
+    )
+    doctor.add_argument("env", help="id of the environment")
+    doctor.add_argument("demo", type=Path, help="demonstration")
+    doctor.add_argument(
+        "--episodes", type=int, default=5, help="guided episodes, plain and corrected each (5)"
+    )
+    doctor.add_argument("--image", help="where pictures come from: obs, obs:KEY or render (obs)")
+    doctor.add_argument("--preset", help="a section of zoo_configs/td3bc.yml")
+    doctor.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="as for train"
+    )
+    doctor.add_argument("--html", type=Path, metavar="FILE", help="write a page, too")
 
     train = commands.add_parser("train", help="learn, evaluate, and write a report")
     train.add_argument("--env", help="id of the environment")
@@ -249,8 +267,19 @@ def _report(run: Path, out: Path | None) -> None:
     print(f"report: {write_report(run, out)}")
 
 
+def _doctor(args: argparse.Namespace) -> int:
+    from regil_sb3 import doctor, process
+
+    process.set_threads()
+    overrides = [*args.set, *([] if args.image is None else [f"image={args.image}"])]
+    return doctor.main(args.env, args.demo, args.episodes, overrides, args.preset, args.html)
+
+
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; 0 when it worked, 2 for bad input (one line says what), 130 for Ctrl-C."""
+    """Run a command; 0 when it worked, 2 for bad input (one line says what), 130 for Ctrl-C.
+
+    `doctor` also has 1: something is wrong with the demonstration.
+    """
     args = _parser().parse_args(argv)
     from gymnasium.error import Error as GymnasiumError
 
@@ -265,6 +294,8 @@ def main(argv: list[str] | None = None) -> int:
             _record(args.env, out, args.seed, env_kwargs, args.encoder_size)
         elif args.command == "convert":
             _convert(args)
+        elif args.command == "doctor":
+            return _doctor(args)
         elif args.command == "train":
             _train(args)
         elif args.command == "evaluate":
