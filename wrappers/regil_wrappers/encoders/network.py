@@ -33,7 +33,8 @@ class NetworkEncoder:
             on a GPU, hardly worth it on a processor.
         compile: whether ``torch.compile`` compiles `features`, at the first call and for each new
             batch size once: seconds to minutes.
-        batch: at most so many frames are encoded at once; more are taken in turns.
+        batch: at most so many frames are encoded at once; more are taken in turns. None: 2 on a
+            processor, whose caches more of them leave (docs/retrieval.md), else 32.
 
     Raises:
         ValueError: if an option is out of range, or there is no such device.
@@ -51,14 +52,14 @@ class NetworkEncoder:
         device: str | None = None,
         precision: str = "float32",
         compile: bool = False,
-        batch: int = 32,
+        batch: int | None = None,
     ) -> None:
         self._torch = torch = import_torch()
         self._device = check_execution(device, precision, compile, batch)
         self._network = network.eval().to(self._device)
         self._features = torch.compile(features) if compile else features
         self._precision = precision
-        self._batch = batch
+        self._batch = batch or (2 if self._device.type == "cpu" else 32)
         self._preprocessing = preprocessing
         self._mean, self._std = (
             torch.tensor(values, device=self._device).view(1, 3, 1, 1)
@@ -91,7 +92,10 @@ class NetworkEncoder:
 
 
 def check_execution(
-    device: str | None = None, precision: str = "float32", compile: bool = False, batch: int = 32
+    device: str | None = None,
+    precision: str = "float32",
+    compile: bool = False,
+    batch: int | None = None,
 ) -> Any:
     """Refuse options out of range, before a network is loaded; return the torch device.
 
@@ -100,7 +104,8 @@ def check_execution(
     """
     one_of("precision", precision, PRECISIONS)
     one_of("compile", compile, (True, False))
-    whole_number("batch", batch)
+    if batch is not None:
+        whole_number("batch", batch)
     torch = import_torch()
     name = device or ("cuda" if torch.cuda.is_available() else "cpu")
     try:

@@ -62,7 +62,7 @@ class TimmEncoder(NetworkEncoder):
         crop: None for the whole picture, else the share of it that is kept (`Preprocessing`).
         precision: "float32", "float16" or "bfloat16".
         compile: whether ``torch.compile`` is used.
-        batch: at most so many frames are encoded at once.
+        batch: at most so many frames are encoded at once; None as in `NetworkEncoder`.
 
     Raises:
         ImportError: if torch or timm is not installed.
@@ -82,7 +82,7 @@ class TimmEncoder(NetworkEncoder):
         crop: float | None = None,
         precision: str = "float32",
         compile: bool = False,
-        batch: int = 32,
+        batch: int | None = None,
     ) -> None:
         one_of("features", features, FEATURES)
         one_of("projection", projection, (True, False))
