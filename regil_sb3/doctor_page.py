@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import html
-import os
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -14,6 +13,7 @@ from string import Template
 
 from regil_wrappers import Demonstration
 
+from regil_sb3.files import replacing
 from regil_sb3.findings import Finding
 from regil_sb3.pictures import data_uri, film_player
 
@@ -59,9 +59,8 @@ def write_page(
         footer="Made by regil doctor.",
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(page, "utf-8")
-    os.replace(temporary, path)
+    with replacing(path) as file:
+        file.write(page.encode())
 
 
 def _row(finding: Finding) -> str:

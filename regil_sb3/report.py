@@ -10,7 +10,6 @@ import csv
 import html
 import json
 import math
-import os
 from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -24,6 +23,7 @@ from regil_wrappers.alignment import squared_distances
 from regil_wrappers.encoders import embed, runs_code
 
 from regil_sb3.charts import Line, Point, line_chart
+from regil_sb3.files import replacing
 from regil_sb3.guide_view import guide_picture, guide_view
 from regil_sb3.pictures import AlignedEpisode, alignment_picture, film_player
 
@@ -120,9 +120,8 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
         "the offline TD3+BC.",
     )
     out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(out.name + ".tmp")
-    temporary.write_text(page, "utf-8")
-    os.replace(temporary, out)
+    with replacing(out) as file:
+        file.write(page.encode())
     return out
 
 

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from io import BufferedWriter
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +11,7 @@ import numpy as np
 from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
+from regil_sb3.files import replacing
 from regil_sb3.replay_buffer import FrameReplayBuffer
 from regil_sb3.success_buffer import SuccessBuffer
 from regil_sb3.td3bc import TD3BC
@@ -30,17 +27,6 @@ def refuse_finished(run: Path) -> None:
         raise ValueError(
             f"{run} holds a run already: choose another --out, or go on with --resume {run}"
         )
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[BufferedWriter]:
-    """Write beside the old file, then replace it in one step: a failed write loses nothing."""
-    temporary = path.with_name(f".{path.name}")
-    with temporary.open("wb") as file:
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def save_model(model: TD3BC, path: Path) -> None:

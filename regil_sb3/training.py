@@ -32,13 +32,13 @@ from regil_sb3.evaluation import (
     guide_act,
     policy_act,
 )
+from regil_sb3.files import replacing
 from regil_sb3.run_folder import (
     AppendingCSV,
     best_so_far,
     load_buffers,
     load_calibration,
     refuse_finished,
-    replacing,
     save_buffers,
     save_calibration,
     save_model,
