@@ -23,6 +23,7 @@ from regil_sb3.bench_rewards import TASKS
 from regil_sb3.envs import METAWORLD_TASKS
 from regil_sb3.recording import EVALUATION_SEEDS, record_expert
 from regil_sb3.settings import presets
+from regil_sb3.timing import Timed
 
 __all__ = ["DISTURBANCES", "Collected", "Guided", "guide", "main", "success_buffer", "table"]
 
@@ -82,25 +83,6 @@ class _Disturbed(gym.ObservationWrapper[Frame, npt.NDArray[np.float32], Frame]):
         changed: Frame = observation.copy()
         changed[y : y + _DISTRACTOR, x : x + _DISTRACTOR] = self._square
         return changed
-
-
-class _Timed(gym.Wrapper[Any, Any, Any, Any]):
-    """Keeps the seconds that the environment inside takes, so that they can be deducted."""
-
-    seconds = 0.0
-
-    def reset(self, **kwargs: Any) -> Any:
-        return self._timed(lambda: self.env.reset(**kwargs))
-
-    def step(self, action: Any) -> Any:
-        return self._timed(lambda: self.env.step(action))
-
-    def _timed(self, call: Callable[[], Any]) -> Any:
-        start = time.perf_counter()
-        try:
-            return call()
-        finally:
-            self.seconds += time.perf_counter() - start
 
 
 @dataclass(frozen=True)
@@ -197,7 +179,7 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     failed_or_not = [_play(plain, goal) for goal in goals]
     plain.close()
 
-    timed = _Timed(_make(task, disturbance))
+    timed = Timed(_make(task, disturbance))
     own = {**_arguments(), "disturbance": 0.0}
     if disturbance == "mirror-auto":
         own["mirror"] = "auto"

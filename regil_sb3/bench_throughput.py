@@ -27,6 +27,7 @@ from regil_sb3.policies import ConvEncoder
 from regil_sb3.recording import record_expert
 from regil_sb3.settings import Settings, make_settings
 from regil_sb3.td3bc import TD3BC
+from regil_sb3.timing import Timed
 
 __all__ = ["Row", "main", "throughput"]
 
@@ -56,24 +57,6 @@ class Row:
     rest_ms: float
 
 
-class _Timed(gym.Wrapper[Any, Any, Any, Any]):
-    """Adds up how long the environment inside it takes."""
-
-    seconds = 0.0
-
-    def step(self, action: Any) -> Any:
-        begun = time.perf_counter()
-        out = self.env.step(action)
-        self.seconds += time.perf_counter() - begun
-        return out
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        begun = time.perf_counter()
-        out = self.env.reset(seed=seed, options=options)
-        self.seconds += time.perf_counter() - begun
-        return out
-
-
 class _Side:
     """An algorithm on its own environment, and where its time goes: [inside, outside, update]."""
 
@@ -83,11 +66,11 @@ class _Side:
         settings: Settings,
         demo: Path,
     ) -> None:
-        self.inside = _Timed(gym.make(settings.env, **settings.env_kwargs))
+        self.inside = Timed(gym.make(settings.env, **settings.env_kwargs))
         wrapped: gym.Env[Any, Any] = self.inside
         for wrapper, arguments in settings.wrappers(str(demo)):
             wrapped = wrapper(wrapped, **arguments)
-        self.outside = _Timed(wrapped)
+        self.outside = Timed(wrapped)
         self.env = VecFrameStack(DummyVecEnv([lambda: self.outside]), settings.frame_stack)
         self.model: Any = make(self.env)
         self.model.set_logger(Logger(None, []))
