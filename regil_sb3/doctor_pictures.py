@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration
 from regil_wrappers.alignment import squared_distances
-from regil_wrappers.frames import FrameSource, check_recorded_settings
+from regil_wrappers.frames import AS_RECORDED, FrameSource, check_recorded_settings
 from regil_wrappers.guide_arguments import fitting_actions
 from regil_wrappers.registration import register
 from regil_wrappers.rewards import arc_length
@@ -36,7 +36,6 @@ __all__ = [
 ]
 
 _LABEL = "the demonstration"
-_RECORDED = ("camera", "render", "action_repeat")  # what `check_recorded_settings` compares
 
 # A first picture whose nearest fresh one is farther off than fresh ones are from their nearest
 # ("far", as a multiple) may still be of the same scene with the target at another place.
@@ -62,8 +61,8 @@ def check_recorded(env: gym.Env[Any, Any], demo: Demonstration) -> list[Finding]
     Camera, render settings, action repeat and actions a second; what either does not state passes.
     """
     found = []
-    for name in _RECORDED:
-        one = {**dict.fromkeys(_RECORDED), name: demo.metadata[name]}
+    for name in AS_RECORDED:
+        one = {**dict.fromkeys(AS_RECORDED), name: demo.metadata[name]}
         try:
             check_recorded_settings(env, one, _LABEL)
         except ValueError as error:
@@ -140,7 +139,7 @@ def check_scene(
         line = f"it was recorded in {recorded!r}: is {env_id!r} the same task and scene?"
         found.append(Finding("task", "warning", line))
     to_fresh = np.sqrt(squared_distances(embedded[0], fresh))
-    between = np.sqrt(np.stack([squared_distances(row, fresh) for row in fresh]))
+    between = np.sqrt(squared_distances(fresh, fresh))
     np.fill_diagonal(between, np.inf)
     steps = _steps(embedded)
     step = float(np.median(steps[steps > 0])) if steps.any() else 0.0
@@ -272,7 +271,7 @@ def _ambiguous(
     embedded = embedded[::every]
     n = len(embedded)
     way = arc_length(embedded)
-    squares = np.stack([squared_distances(row, embedded) for row in embedded])
+    squares = squared_distances(embedded, embedded)
     window = min(horizon + 1, n)
     recent = np.zeros((n - window + 1,) * 2)
     for i in range(window):

@@ -18,10 +18,17 @@ from numpy.typing import NDArray
 
 from regil_wrappers.demonstration import Demonstration
 
-__all__ = ["Asked", "FrameSource", "check_recorded_settings", "check_size", "check_upright"]
+__all__ = [
+    "AS_RECORDED",
+    "Asked",
+    "FrameSource",
+    "check_recorded_settings",
+    "check_size",
+    "check_upright",
+]
 
-# What decides how frames look and follow each other, where an environment states it.
-_AS_RECORDED = ("camera", "render", "action_repeat")
+AS_RECORDED = ("camera", "render", "action_repeat")
+"""What decides how frames look and follow each other, where an environment states it."""
 
 # A first frame counts as turned when most of a 28 x 28 picture differs from the demonstration's (by
 # more than _DIFFERENT of 255 in some channel) and turning it leaves less than half of that. Objects
@@ -234,7 +241,7 @@ def check_recorded_settings(env: Asked, metadata: dict[str, Any], label: str) ->
         ValueError: naming the setting and both values.
     """
     here = env.unwrapped.metadata.get("regil") or {}
-    for name in _AS_RECORDED:
+    for name in AS_RECORDED:
         recorded = metadata[name]
         if recorded not in (None, {}) and here.get(name, recorded) != recorded:
             raise ValueError(
