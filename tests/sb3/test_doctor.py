@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import toy_camera
 from regil_wrappers import Demonstration, make_encoder
 
 from regil_sb3 import doctor
@@ -19,10 +18,6 @@ from regil_sb3.doctor_pictures import check_actions, check_motion, check_recorde
 from regil_sb3.doctor_rewards import Reward, check_reward, judged
 from regil_sb3.findings import Finding, status, table
 from regil_sb3.settings import make_settings
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "wrappers"))
-
-import toy_camera
 
 ENV = "ToyCamera-v0"
 SPACE = gym.spaces.Box(-1, 1, (4,), np.float32)

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+import toy_camera
 from regil_wrappers import RetrievalGuideWrapper
 
 from regil_sb3.guide_view import guide_picture, guide_view
 from regil_sb3.report import write_report
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "wrappers"))
-
-import toy_camera
 
 
 @pytest.fixture(scope="module")

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import doctest
-import sys
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+import toy_camera
+import toy_env
 from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import (
@@ -27,29 +27,12 @@ from stable_baselines3.common.vec_env import (
 from regil_sb3 import TD3BC, VecRetrievalGuide, VecRetrievalReward, vec_env
 from regil_sb3.relabelling import AfterFirstEpisode, EpisodeRewardReplayBuffer, rewards_come_late
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "wrappers"))
-
-import toy_camera
-import toy_env
-
 LENGTHS = (7, 12, 7)
 
 
 def small() -> dict[str, Any]:
     extractor = {"features_extractor_kwargs": {"features_dim": 16}}
     return {"policy_kwargs": {**extractor, "net_arch": [8]}, "device": "cpu", "seed": 0}
-
-
-@pytest.fixture(scope="module")
-def demo() -> Demonstration:
-    return toy_env.record()
-
-
-@pytest.fixture(scope="module")
-def demo_path(demo: Demonstration, tmp_path_factory: pytest.TempPathFactory) -> str:
-    path: Path = tmp_path_factory.mktemp("demos") / "reach.hdf5"
-    demo.save(path)
-    return str(path)
 
 
 def toy(steps: int, **settings: Any) -> gym.Env[Any, Any]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import toy_env
 from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
@@ -19,22 +18,6 @@ from stable_baselines3.common.vec_env import (
     VecFrameStack,
     VecTransposeImage,
 )
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "wrappers"))
-
-import toy_env
-
-
-@pytest.fixture(scope="module")
-def demo() -> Demonstration:
-    return toy_env.record()
-
-
-@pytest.fixture(scope="module")
-def demo_path(demo: Demonstration, tmp_path_factory: pytest.TempPathFactory) -> str:
-    path: Path = tmp_path_factory.mktemp("demos") / "reach.hdf5"
-    demo.save(path)
-    return str(path)
 
 
 def stack(demo: str) -> gym.Env[Any, Any]:
