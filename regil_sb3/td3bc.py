@@ -277,11 +277,7 @@ class TD3BC(TD3):
         self.replay_buffer_class = chosen
         self._returns: dict[str, list[float]] = {}
         assert self.action_space.shape is not None
-        self._collection = Collection(
-            self.n_envs,
-            self.action_space.shape,
-            self.keep_own_successes,
-        )
+        self._collection = Collection(self.n_envs, self.action_space.shape, self.keep_own_successes)
 
     def _check_demo(self) -> None:
         if self.bc_coef == 0:
