@@ -152,25 +152,15 @@ class FrameReplayBuffer(BaseBuffer):
         self.full = self.total >= self.buffer_size
 
     def _stack(
-        self,
-        newest: npt.NDArray[Any],
-        time: npt.NDArray[Any],
-        age: npt.NDArray[Any],
-        env: npt.NDArray[Any],
+        self, time: npt.NDArray[Any], age: npt.NDArray[Any], env: npt.NDArray[Any]
     ) -> npt.NDArray[Any]:
-        """Stack ``newest`` (B, C, H, W) on the frames before ``time``; zeros before the episode."""
-        if self.n_stack == 1:
-            return newest
-        channels = self.frame_shape[0]
-        stacked = np.empty(
-            (len(newest), self.n_stack * channels, *self.frame_shape[1:]), newest.dtype
-        )
-        stacked[:, -channels:] = newest
-        for back in range(1, self.n_stack):
-            stop = (self.n_stack - back) * channels
-            stacked[:, stop - channels : stop] = self.frames[(time - back) % self.n_frames, env]
-            stacked[age < back, stop - channels : stop] = 0
-        return stacked
+        """Frames up to ``time``, (B, n_stack * C, H, W); zeros before the episode."""
+        back = np.arange(self.n_stack - 1, -1, -1)
+        stacked: npt.NDArray[Any] = self.frames[
+            (time[:, None] - back) % self.n_frames, env[:, None]
+        ]
+        stacked[age[:, None] < back] = 0
+        return stacked.reshape(len(time), -1, *self.frame_shape[1:])
 
     def _get_samples(
         self, batch_inds: npt.NDArray[Any], env: VecNormalize | None = None
@@ -195,13 +185,10 @@ class FrameReplayBuffer(BaseBuffer):
         last_time = time + last
         last_pos = last_time % self.buffer_size
         done = self.dones[last_pos, envs]
-        following = self.frames[(last_time + 1) % self.n_frames, envs]
+        next_obs = self._stack(last_time + 1, self.ages[last_pos, envs] + 1, envs)
         for i in np.flatnonzero(done):
-            following[i] = self.ends[int(last_pos[i]), int(envs[i])]
-        next_obs = self._stack(following, last_time + 1, self.ages[last_pos, envs] + 1, envs)
-        obs = self._stack(
-            self.frames[time % self.n_frames, envs], time, self.ages[batch_inds, envs], envs
-        )
+            self._newest(next_obs)[i] = self.ends[int(last_pos[i]), int(envs[i])]
+        obs = self._stack(time, self.ages[batch_inds, envs], envs)
         terminal = done * (1.0 - self.timeouts[last_pos, envs])
         return ReplayBufferSamples(
             observations=self.to_torch(obs, copy=False),

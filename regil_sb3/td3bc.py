@@ -17,7 +17,7 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     MaybeCallback,
@@ -473,19 +473,19 @@ class TD3BC(TD3):
         observations = (
             {k: th.as_tensor(v, device=self.device) for k, v in seen.items()}
             if isinstance(seen, dict)
-            else self._augmented(th.as_tensor(seen, device=self.device))
+            else th.as_tensor(seen, device=self.device)
         )
-        predicted = self.actor(observations)
+        predicted = self.actor.mu(encode(self.actor, self._preprocessed(observations)))
         error = F.mse_loss(predicted, th.as_tensor(actions, device=self.device), reduction="none")
         loss = error.sum(dim=1).mean()
         return loss if self.bc_loss == "mse" else loss / (2.0 * self.bc_std**2)
 
-    def _augmented(self, observations: Any) -> Any:
-        return (
-            self.policy.augment(observations)
-            if isinstance(self.policy, ImagePolicy)
-            else observations
-        )
+    def _preprocessed(self, observations: Any) -> Any:
+        """As SB3 hands them to an encoder, images augmented; once for all networks."""
+        if isinstance(self.policy, ImagePolicy):
+            images = self.policy.augment(observations).float()
+            return images.div_(255) if self.policy.normalize_images else images
+        return preprocess_obs(observations, self.observation_space, self.policy.normalize_images)
 
     def pretrain_bc(self, steps: int, progress: Callable[[int], None] | None = None) -> None:
         """Train the actor by the BC term alone; its target averages over the last updates.
@@ -549,8 +549,8 @@ class TD3BC(TD3):
             self._n_updates += 1
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
-            observations = self._augmented(replay_data.observations)
-            next_observations = self._augmented(replay_data.next_observations)
+            observations = self._preprocessed(replay_data.observations)
+            next_observations = self._preprocessed(replay_data.next_observations)
             dones = (
                 th.zeros_like(replay_data.dones) if self.bootstrap_success else replay_data.dones
             )
@@ -589,10 +589,13 @@ class TD3BC(TD3):
                 actor_loss = th.zeros((), device=self.device)
                 q_coef = self.q_coef_now()
                 if q_coef > 0:
-                    # A shared encoder is trained by critic and BC term: here its features are fixed
+                    # Critic and BC term alone train an image policy's encoders; another policy's
+                    # features are taken anew, as TD3 does
                     with th.no_grad():
                         features = (
-                            features.detach() if shared else encode(self.critic, observations)
+                            features.detach()
+                            if isinstance(self.policy, ImagePolicy)
+                            else encode(self.critic, observations)
                         )
                     with th.set_grad_enabled(getattr(self.policy, "q_trains_encoder", True)):
                         seen = features if shared else encode(self.actor, observations)
@@ -668,9 +671,9 @@ class TD3BC(TD3):
         ]
 
 
-def encode(network: Any, observations: Any) -> th.Tensor:
+def encode(network: Any, preprocessed: Any) -> th.Tensor:
     """Features (B, F) of an actor or a critic of SB3's."""
-    features: th.Tensor = network.extract_features(observations, network.features_extractor)
+    features: th.Tensor = network.features_extractor(preprocessed)
     return features
 
 
