@@ -31,9 +31,11 @@ clean:
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # torch first and alone: another package's open range would fetch the newest build of it.
+# The simulators of LIBERO last: what they declare to need, they do not, and it holds a second OpenCV.
 $(STAMP): $(SETTINGS)
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet -c constraints.txt \
 	    $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ./wrappers -e '.[tests]'
+	$(BIN)/python -m pip install --quiet --no-deps -c constraints.txt robosuite hf-libero bddl
 	touch $@

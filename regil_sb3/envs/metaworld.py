@@ -6,12 +6,7 @@
 
 from __future__ import annotations
 
-import atexit
 import difflib
-import functools
-import importlib
-import os
-import sys
 import warnings
 from typing import Any, ClassVar
 
@@ -22,6 +17,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
 from regil_sb3.envs import METAWORLD_TASKS
+from regil_sb3.envs.rendering import Renderer, prepare_graphics
 
 __all__ = ["CAMERAS", "MetaWorldEnv"]
 
@@ -39,85 +35,6 @@ on imitation from pixels use them (`corner3-near` for hammer, door and window, `
 the rest). The default `corner4` is `corner2` moved to (0.75, 0.075, 0.7) m."""
 
 _STATE_BOUND = 10.0  # m; Meta-World's own bounds are infinite, and checkers warn of that
-
-
-class _Renderer:
-    """Draws one camera of one model, off screen, in any square size.
-
-    MuJoCo's own `Renderer` draws in one size only, copies each picture twice, and has an OpenGL
-    context of its own: with several, it is chance whose pictures a garbage collection frees.
-    """
-
-    def __init__(self, model: Any, camera: int, size: int) -> None:
-        import mujoco  # type: ignore[import-untyped]
-
-        self._mujoco = mujoco
-        self._model = model
-        self._gl = _gl_context()
-        self._gl.make_current()
-        self._scene = mujoco.MjvScene(model, maxgeom=1000)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
-        self._options = mujoco.MjvOption()
-        self._options.sitegroup[:] = 0  # sites are marks, and the goal is one of them
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = camera
-        self._perturbation = mujoco.MjvPerturb()
-        model.vis.global_.offwidth = model.vis.global_.offheight = self._size = size
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
-
-    def draw(self, data: Any, size: int) -> Frame:
-        """Draw the scene: (size, size, 3) uint8, in OpenGL's order (bottom row first)."""
-        mujoco = self._mujoco
-        view = mujoco.MjrRect(0, 0, size, size)
-        frame = np.empty((size, size, 3), np.uint8)
-        self._gl.make_current()
-        if size > self._size:
-            mujoco.mjr_resizeOffscreen(size, size, self._context)
-            self._size = size
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        mujoco.mjv_updateScene(
-            self._model,
-            data,
-            self._options,
-            self._perturbation,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL,
-            self._scene,
-        )
-        mujoco.mjr_render(view, self._scene, self._context)
-        mujoco.mjr_readPixels(frame, None, view, self._context)
-        return frame
-
-    def close(self) -> None:
-        """Free what the graphics library holds; nothing can be drawn afterwards."""
-        self._gl.make_current()
-        self._context.free()
-
-
-@functools.cache
-def _gl_context() -> Any:
-    """Make the one OpenGL context of this process, of the backend that MUJOCO_GL names."""
-    backend = os.environ.get("MUJOCO_GL", "").lower() or "glfw"
-    try:
-        module = importlib.import_module(f"mujoco.{backend}")
-    except ModuleNotFoundError:
-        raise ValueError(f"MUJOCO_GL={backend!r} must be one of egl, glfw, osmesa") from None
-    context = module.GLContext(64, 64)
-    # Registered last, hence run first: before the library closes its display.
-    atexit.register(context.free)
-    return context
-
-
-def _prepare_graphics() -> None:
-    """Choose what the user left open, before the graphics library reads it."""
-    display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-    if sys.platform == "linux" and not display:
-        os.environ.setdefault("MUJOCO_GL", "egl")
-    # Mesa's software renderer: its threads do not survive a fork (the child would hang), and at
-    # these sizes they save nothing.
-    os.environ.setdefault("LP_NUM_THREADS", "0")
 
 
 class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle):
@@ -210,7 +127,7 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
         ):
             if value < 1:
                 raise ValueError(f"{name} {value!r} must be at least 1")
-        _prepare_graphics()
+        prepare_graphics()
         try:
             from metaworld.env_dict import ENV_CLS_MAP
             from metaworld.policies import ENV_POLICY_MAP
@@ -218,7 +135,7 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
             raise ImportError(
                 f"Meta-World is not installed ({error}): pip install 'regil-sb3[metaworld]'"
             ) from None
-        import mujoco
+        import mujoco  # type: ignore[import-untyped]
 
         self.render_mode = render_mode
         self._obs_kind = obs
@@ -234,8 +151,6 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
         del sim.sawyer_observation_space  # cached while the goal was still masked
         sim.max_path_length = max_steps * action_repeat + 1  # the limit is ours
 
-        quality = sim.model.vis.quality
-        quality.shadowsize = quality.offsamples = 0  # read once, when a context is made
         start, *pose = _MOVED.get(camera, (camera,))
         self._camera = sim.model.camera(start).id
         if pose:
@@ -243,7 +158,7 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
         mujoco.mj_forward(sim.model, sim.data)
         # Most of Meta-World's cameras hang upside down: their up axis points at the floor.
         self._upside_down = bool(sim.data.cam_xmat[self._camera, 7] < 0)
-        self._renderer: _Renderer | None = None
+        self._renderer: Renderer | None = None
         self._state: npt.NDArray[np.float64] | None = None
         self._steps = 0
 
@@ -356,7 +271,7 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
             (size, size, 3) uint8, upright.
         """
         if self._renderer is None:
-            self._renderer = _Renderer(self._sim.model, self._camera, size)
+            self._renderer = Renderer(self._sim.model, self._camera, size)
         frame = self._renderer.draw(self._sim.data, size)
         # OpenGL's rows run upwards: a camera that hangs upside down needs no flip of them.
         return frame if self._upside_down else frame[::-1].copy()

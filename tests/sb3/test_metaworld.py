@@ -16,7 +16,8 @@ from gymnasium.vector import AsyncVectorEnv
 
 import regil_sb3.envs
 from regil_sb3.envs import METAWORLD_TASKS, metaworld
-from regil_sb3.envs.metaworld import CAMERAS, MetaWorldEnv, _prepare_graphics
+from regil_sb3.envs.metaworld import CAMERAS, MetaWorldEnv
+from regil_sb3.envs.rendering import prepare_graphics
 
 BUTTON = "regil/metaworld-button-press-v0"
 PAPER_TASKS = (
@@ -130,8 +131,8 @@ def test_same_frames_in_another_process_that_ends_without_a_word(make):
     # It closes nothing, and a module that outlives the others holds the graphics context: the
     # library must not complain when Python ends.
     code = (
-        "import hashlib, threading; from regil_sb3.envs import metaworld; "
-        "e = metaworld.MetaWorldEnv('hammer'); threading.kept = metaworld._gl_context(); "
+        "import hashlib, threading; from regil_sb3.envs import metaworld, rendering; "
+        "e = metaworld.MetaWorldEnv('hammer'); threading.kept = rendering._gl_context(); "
         "print(hashlib.sha256(e.reset(seed=3)[0].tobytes() + e.step([1, 1, 1, 1])[0].tobytes())"
         ".hexdigest())"
     )
@@ -253,13 +254,13 @@ def test_graphics_library_is_chosen_only_where_the_user_chose_none(monkeypatch):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setenv("DISPLAY", ":0")
-    _prepare_graphics()
+    prepare_graphics()
     assert "MUJOCO_GL" not in os.environ
     monkeypatch.delenv("DISPLAY")
-    _prepare_graphics()
+    prepare_graphics()
     assert os.environ["MUJOCO_GL"] == "egl"
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    _prepare_graphics()
+    prepare_graphics()
     assert os.environ["MUJOCO_GL"] == "osmesa"
 
 
@@ -436,7 +437,7 @@ def test_missing_meta_world_names_the_extra(monkeypatch):
 
 
 def test_unknown_graphics_library_gets_one_line():
-    code = "from regil_sb3.envs.metaworld import _gl_context as g; g()"
+    code = "from regil_sb3.envs.rendering import _gl_context as g; g()"
     run = subprocess.run(
         [sys.executable, "-c", code],
         env={**os.environ, "MUJOCO_GL": "off"},

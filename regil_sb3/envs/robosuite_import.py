@@ -1,0 +1,50 @@
+"""robosuite 1.4, imported without what its import does to a process.
+
+It writes a log file that other users of the machine cannot open, warns of a file that nobody needs,
+and sets MUJOCO_GL. Pictures are drawn by `regil_sb3.envs.rendering` instead.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+__all__ = ["INSTALL", "import_robosuite"]
+
+INSTALL = (
+    "pip install 'regil-sb3[libero]', "
+    "then pip install --no-deps robosuite==1.4.0 hf-libero==0.1.4 bddl==1.0.1"
+)
+"""The last three declare dependencies that are not needed, among them a second OpenCV."""
+
+
+def import_robosuite() -> Any:
+    """Import robosuite, once its settings are quiet.
+
+    Returns:
+        the package.
+
+    Raises:
+        ImportError: where it is not installed, or in another version.
+    """
+    if "robosuite" not in sys.modules:
+        spec = importlib.util.find_spec("robosuite")
+        if spec is None or spec.origin is None:
+            raise ImportError(f"robosuite is not installed: {INSTALL}")
+        # Read by the package's own first lines, so that it must be there before them
+        path = Path(spec.origin).with_name("macros.py")
+        own = importlib.util.spec_from_file_location("robosuite.macros", path)
+        if own is None or own.loader is None:
+            raise ImportError(f"{path} cannot be imported: {INSTALL}")
+        macros: Any = importlib.util.module_from_spec(own)
+        own.loader.exec_module(macros)
+        macros.MUJOCO_GPU_RENDERING = False
+        macros.FILE_LOGGING_LEVEL, macros.CONSOLE_LOGGING_LEVEL = None, "ERROR"
+        sys.modules["robosuite.macros"] = macros
+    import robosuite  # type: ignore[import-untyped]
+
+    if not robosuite.__version__.startswith("1.4."):
+        raise ImportError(f"robosuite {robosuite.__version__} is not 1.4: {INSTALL}")
+    return robosuite
