@@ -24,6 +24,7 @@ _RANGES: dict[str, tuple[tuple[type, ...], float, float]] = {
     "target_policy_noise": (_NUMBER, 0.0, np.inf),
     "target_noise_clip": (_NUMBER, 0.0, np.inf),
     "warmup_steps": ((int,), 0, np.inf),
+    "guide_again": (_NUMBER, 0.0, 1.0),
     "bc_coef": (_NUMBER, 0.0, np.inf),
     "bc_floor": (_NUMBER, 0.0, 1.0),
     "bc_std": (_NUMBER, 1e-6, np.inf),

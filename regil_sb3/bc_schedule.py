@@ -36,6 +36,7 @@ class BySuccess:
         self.share = 1.0
         self.best = 0.0
         self.recent: deque[bool] = deque(maxlen=RECENT)
+        self.guide = [0, 0]  # its successes, its episodes
 
     def episode(self, success: bool, part: float) -> None:
         """An episode of the policy's own has ended.
@@ -52,3 +53,16 @@ class BySuccess:
         self.best = max(self.best, rate)
         change = -part if rate >= self.best - KEEPS_UP else BACK * part
         self.share = float(np.clip(self.share + change, self.floor, 1.0))
+
+    def guided_episode(self, success: bool) -> None:
+        """An episode in which the guide acted has ended."""
+        self.guide[0] += success
+        self.guide[1] += 1
+
+    @property
+    def behind_guide(self) -> bool:
+        """Whether the policy succeeds less often than the guide, or has not shown that it does."""
+        successes, episodes = self.guide
+        if successes == 0:
+            return False
+        return len(self.recent) < FEW or bool(np.mean(self.recent) < successes / episodes)

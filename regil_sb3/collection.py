@@ -15,7 +15,7 @@ _REWARDS = ("env_reward", "retrieval_reward")
 class Collection:
     """The open episodes of some environments.
 
-    An episode of the warm-up is the guide's, to its end; the others are the policy's.
+    An episode is the guide's or the policy's, to its end; in the warm-up it is the guide's.
 
     Args:
         n_envs: environments.
@@ -23,7 +23,8 @@ class Collection:
         keeps_own: whether the policy's episodes are kept too.
 
     Attributes:
-        warmup: (n_envs,) bool: where the guide acts.
+        guided: (n_envs,) bool: where the guide acts.
+        warmup: (n_envs,) bool: where it does because the episode began in the warm-up.
         lengths: (n_envs,) int: steps of each open episode.
         succeeded: (n_envs,) bool: whether it succeeded at any step.
     """
@@ -36,7 +37,7 @@ class Collection:
     def restart(self, warmup: bool) -> None:
         """Every environment was reset, whatever it was doing."""
         n_envs = len(self._labels)
-        self.warmup = np.full(n_envs, warmup)
+        self.guided, self.warmup = np.full((2, n_envs), warmup)
         self.lengths = np.zeros(n_envs, int)
         self.succeeded = np.zeros(n_envs, bool)
         self._demonstrates = np.zeros(n_envs, bool)  # an episode's first step tells
@@ -45,9 +46,10 @@ class Collection:
         for env in range(n_envs):
             self.begin(env, warmup)
 
-    def begin(self, env: int, warmup: bool) -> None:
+    def begin(self, env: int, warmup: bool, guided: bool = False) -> None:
         """The environment's next episode begins, in the warm-up or not."""
         self.warmup[env] = warmup
+        self.guided[env] = warmup or guided
         self.lengths[env] = 0
         self.succeeded[env] = self._demonstrates[env] = False
         self._steps[env] = []
@@ -75,7 +77,7 @@ class Collection:
         """
         retrieval = info.get("retrieval", {})
         self._demonstrates[env] = not retrieval.get("calibrating", False)
-        guided = self.warmup[env]
+        guided = self.guided[env]
         if guided or self._keeps_own:
             before = (
                 {k: v[env].copy() for k, v in seen.items()}
@@ -89,6 +91,10 @@ class Collection:
         self._returns["retrieval_reward"][env] += reward + late
         self.lengths[env] += 1
 
+    def calibrating(self, env: int) -> bool:
+        """Whether the guide moved to learn how its camera sees, in the environment's episode."""
+        return not self._demonstrates[env]
+
     def returns(self, env: int) -> dict[str, float]:
         """Undiscounted returns of the environment's episode by name."""
         return {name: float(values[env]) for name, values in self._returns.items()}
@@ -98,7 +104,7 @@ class Collection:
 
         None where it did not succeed, was calibrating, or is not kept.
         """
-        if not (self.succeeded[env] and self._demonstrates[env] and self._steps[env]):
+        if self.calibrating(env) or not (self.succeeded[env] and self._steps[env]):
             return None
         seen, actions = zip(*self._steps[env], strict=True)
         observations: Observations = (

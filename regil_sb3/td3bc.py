@@ -85,6 +85,8 @@ class TD3BC(TD3):
         target_policy_noise: std of the target's smoothing noise.
         target_noise_clip: its limit.
         warmup_steps: steps in which the guide acts. An episode begun in warm-up is finished in it.
+        guide_again: share of the episodes after the warm-up that the guide acts in, from beginning
+            to end, as long as the policy succeeds less often than the guide did.
         bc_coef: lambda at the start; 0 for no BC term.
         bc_floor: lambda's floor as a share of ``bc_coef``.
         bc_steps: steps until lambda would reach 0; None is the whole of ``learn``.
@@ -154,6 +156,7 @@ class TD3BC(TD3):
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.3,
         warmup_steps: int = 5_000,
+        guide_again: float = 0.0,
         bc_coef: float = 2.0,
         bc_floor: float = 0.1,
         bc_steps: int | None = None,
@@ -183,7 +186,7 @@ class TD3BC(TD3):
         if isinstance(env, gym.Env | VecEnv) and not isinstance(env.action_space, spaces.Box):
             raise ValueError(f"the action space is {env.action_space}: TD3BC needs a Box")
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
-        self.warmup_steps = warmup_steps
+        self.warmup_steps, self.guide_again = warmup_steps, guide_again
         self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps
         self.bc_schedule = bc_schedule
         self.keep_own_successes, self.actor_in_warmup = keep_own_successes, actor_in_warmup
@@ -354,7 +357,7 @@ class TD3BC(TD3):
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
         assert isinstance(self.action_space, spaces.Box)
         assert self.env is not None
-        guided = self._collection.warmup
+        guided = self._collection.guided
         if guided.all():
             action = np.zeros((n_envs, *self.action_space.shape), np.float32)
             buffer_action = action.copy()
@@ -415,9 +418,12 @@ class TD3BC(TD3):
 
     def _end_episode(self, env: int) -> None:
         episodes = self._collection
-        if not episodes.warmup[env]:
+        success = bool(episodes.succeeded[env])
+        if not episodes.guided[env]:
             part = episodes.lengths[env] / max(self._total_timesteps - self.warmup_steps, 1)
-            self._by_success.episode(bool(episodes.succeeded[env]), part)
+            self._by_success.episode(success, part)
+        elif not episodes.calibrating(env):
+            self._by_success.guided_episode(success)
         shown = episodes.demonstration(env)
         if shown is not None and not self.success_buffer.add(*shown):
             warnings.warn(
@@ -429,7 +435,9 @@ class TD3BC(TD3):
         for name, value in episodes.returns(env).items():
             self._returns.setdefault(name, []).append(value)
             del self._returns[name][: -self._stats_window_size]
-        episodes.begin(env, self.num_timesteps < self.warmup_steps)
+        behind = self.guide_again > 0 and self._by_success.behind_guide
+        again = behind and np.random.random() < self.guide_again
+        episodes.begin(env, self.num_timesteps < self.warmup_steps, again)
 
     def _check_finite(self, reward: npt.NDArray[Any], new_obs: Any) -> None:
         values = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}
@@ -448,7 +456,7 @@ class TD3BC(TD3):
                 self.logger.record(f"rollout/{name}", safe_mean(values))
         self.logger.record("success_buffer/steps", self.success_buffer.steps)
         self.logger.record("success_buffer/episodes", self.success_buffer.episodes)
-        self.logger.record("time/guided", int(self.in_warmup))
+        self.logger.record("time/guided", int(self._collection.guided.any()))
         self.logger.record("train/reward_scale", self.used_reward_scale)
         super().dump_logs()
 
