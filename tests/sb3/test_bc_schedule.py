@@ -43,3 +43,17 @@ def test_a_policy_that_never_succeeds_is_let_go():
     for _ in range(100):
         schedule.episode(False, 0.02)
     assert schedule.share == 0.1
+
+
+def test_behind_its_guide_until_it_succeeds_as_often():
+    schedule = BySuccess(floor=0.1)
+    assert not schedule.behind_guide  # no guide
+    for success in (False, False, True, True):
+        schedule.guided_episode(success)
+    assert schedule.behind_guide  # not shown yet
+    for success in (False, True) * 5:
+        schedule.episode(success, 0.0)
+    assert not schedule.behind_guide
+    schedule.episode(False, 0.0)
+    schedule.episode(False, 0.0)
+    assert schedule.behind_guide

@@ -270,6 +270,21 @@ def test_going_on_after_a_callback_stopped_in_a_step():
     assert all(length <= Reach.LENGTH for length in lengths)
 
 
+def test_guide_acts_again_in_whole_episodes_where_the_policy_fails():
+    env = stacked()
+    never_trained = small(env, learning_starts=10_000, bc_pretrain_steps=0, guide_again=0.5)
+    never_trained.learn(600)
+    (played,) = env.get_attr("executed")
+    own = np.stack(played)[:, 1] != np.float32(0.1)  # what the guide says there
+    dones = never_trained.replay_buffer.dones[:600, 0].astype(bool)
+    episodes = np.split(own, np.flatnonzero(dones) + 1)
+    after = [e for e in episodes if len(e)][6:]  # the warm-up has fewer
+    assert {bool(e[0]) for e in after} == {True, False}
+    assert all((e == e[0]).all() for e in after)
+    kept = [e for e in episodes[: dones.sum()] if not e[0]]
+    assert never_trained.success_buffer.episodes == 1 + len(kept)
+
+
 def test_pretraining_by_nothing_leaves_the_target_alone():
     model = small(stacked())
     model.learn(40)
