@@ -273,10 +273,10 @@ def test_going_on_after_a_callback_stopped_in_a_step():
 def test_guide_acts_again_in_whole_episodes_where_the_policy_fails():
     env = stacked()
     never_trained = small(env, learning_starts=10_000, bc_pretrain_steps=0, guide_again=0.5)
-    never_trained.learn(600)
+    never_trained.learn(400)
     (played,) = env.get_attr("executed")
     own = np.stack(played)[:, 1] != np.float32(0.1)  # what the guide says there
-    dones = never_trained.replay_buffer.dones[:600, 0].astype(bool)
+    dones = never_trained.replay_buffer.dones[:400, 0].astype(bool)
     episodes = np.split(own, np.flatnonzero(dones) + 1)
     after = [e for e in episodes if len(e)][6:]  # the warm-up has fewer
     assert {bool(e[0]) for e in after} == {True, False}
