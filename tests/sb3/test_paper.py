@@ -32,7 +32,7 @@ def test_values_that_the_paper_gives():
 
 # Arguments of TD3BC whose default is what the paper says, or that are no matter of the method.
 AS_THE_PAPER = {
-    "batch_size", "gamma", "tau", "policy_delay", "train_freq", "warmup_steps",
+    "batch_size", "gamma", "tau", "policy_delay", "train_freq", "warmup_steps", "guide_again",
     "success_buffer_size", "keep_own_successes", "bc_schedule", "actor_in_warmup",
     "actor_q", "q_coef", "exploration_std", "bc_std", "target_noise_clip",
 }  # fmt: skip
