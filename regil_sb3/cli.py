@@ -98,6 +98,11 @@ def _parser() -> argparse.ArgumentParser:
     evaluate = commands.add_parser("evaluate", help="evaluate policy, guided replay and BC")
     evaluate.add_argument("run", type=Path)
     evaluate.add_argument("--episodes", type=int, default=40)
+    evaluate.add_argument(
+        "--trust",
+        action="store_true",
+        help="the models may name anything, and so run code: your own policies and encoders",
+    )
 
     report = commands.add_parser("report", help="make the HTML page of a run")
     report.add_argument("run", type=Path)
@@ -238,14 +243,14 @@ def _train(args: argparse.Namespace) -> None:
     _report(run, None)
 
 
-def _evaluate(run: Path, episodes: int) -> None:
+def _evaluate(run: Path, episodes: int, trust: bool = False) -> None:
     from regil_sb3 import process, training
 
     process.keep_freed_memory()
     if episodes < 1:
         raise ValueError(f"--episodes is {episodes}: at least 1 is needed")
     try:
-        results = training.evaluate_run(run, episodes)
+        results = training.evaluate_run(run, episodes, trust)
     except KeyboardInterrupt:
         print(f"\nnot evaluated; later: regil evaluate {run}", file=sys.stderr)
         raise
@@ -299,7 +304,7 @@ def main(argv: list[str] | None = None) -> int:
         elif args.command == "train":
             _train(args)
         elif args.command == "evaluate":
-            _evaluate(args.run, args.episodes)
+            _evaluate(args.run, args.episodes, args.trust)
         elif args.command == "report":
             _report(args.run, args.out)
         elif args.command == "bench":

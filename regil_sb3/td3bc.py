@@ -5,7 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from os import PathLike
-from typing import Any, ClassVar, Literal, TypeVar
+from pickle import UnpicklingError
+from typing import Any, BinaryIO, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -34,6 +35,7 @@ from regil_sb3.arguments import check_arguments
 from regil_sb3.as_seen import as_seen
 from regil_sb3.bc_schedule import BySuccess, by_time
 from regil_sb3.collection import Collection
+from regil_sb3.model_file import checked_model
 from regil_sb3.policies import ImagePolicy
 from regil_sb3.relabelling import EpisodeRewards, episode_reward_class, rewards_come_late
 from regil_sb3.replay_buffer import FrameReplayBuffer
@@ -667,6 +669,37 @@ class TD3BC(TD3):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfTD3BC],
+        path: str | PathLike[str] | BinaryIO,
+        env: GymEnv | None = None,
+        *args: Any,
+        trust: bool = False,
+        **kwargs: Any,
+    ) -> SelfTD3BC:
+        """Load a model, as SB3 does; nothing that the file holds is run.
+
+        Args:
+            path: of the file, or the file itself.
+            env: to go on in; None where the model is only to act.
+            *args: SB3's own, in its order: device, custom_objects, print_system_info, force_reset.
+            trust: whether the file may name anything, and so run code: for policies, encoders and
+                schedules of one's own.
+            **kwargs: SB3's own, or attributes to replace, such as ``buffer_size=1`` and ``demo=``.
+
+        Raises:
+            ValueError: the file is no model, is damaged, or names what is not known to be harmless.
+            OSError: it cannot be read.
+        """
+        if trust:
+            return super().load(path, env, *args, **kwargs)  # type: ignore[arg-type]
+        content: Any = checked_model(path)
+        try:
+            return super().load(content, env, *args, **kwargs)
+        except (UnpicklingError, RuntimeError) as error:
+            raise ValueError(f"{path} does not load: {str(error).splitlines()[0]}") from error
 
     def _excluded_save_params(self) -> list[str]:
         return [

@@ -275,7 +275,7 @@ def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int)
     return model
 
 
-def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
+def evaluate_run(run: Path, episodes: int, trust: bool = False) -> dict[str, Any]:
     """Evaluate a run's last and best model, both guides and BC, and write ``evaluation.json``.
 
     BC is trained here when the folder has no ``bc_model.zip`` yet.
@@ -283,6 +283,7 @@ def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
     Args:
         run: the folder.
         episodes: unseen episodes, the same for each method.
+        trust: whether the models may name anything, and so run code (``TD3BC.load``).
 
     Returns:
         What was written.
@@ -298,9 +299,9 @@ def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
         closing(make_env(settings, run / "demo.hdf5", n_envs=1)) as env,
         closing(make_env(settings.plain(), run / "demo.hdf5", n_envs=1)) as plain_env,
     ):
-        model = TD3BC.load(run / "model.zip", buffer_size=1)
+        model = TD3BC.load(run / "model.zip", trust=trust, buffer_size=1)
         if (run / "bc_model.zip").exists():
-            bc = TD3BC.load(run / "bc_model.zip", buffer_size=1)
+            bc = TD3BC.load(run / "bc_model.zip", trust=trust, buffer_size=1)
         else:
             bc = train_bc(settings, demo, env, BC_UPDATES)
             save_model(bc, run / "bc_model.zip")
@@ -310,7 +311,7 @@ def evaluate_run(run: Path, episodes: int) -> dict[str, Any]:
         }
         acts: list[tuple[str, Act, VecEnv]] = [("policy", policy_act(model), env)]
         if (run / "best_model.zip").exists():
-            best = TD3BC.load(run / "best_model.zip", buffer_size=1)
+            best = TD3BC.load(run / "best_model.zip", trust=trust, buffer_size=1)
             acts.append(("best_policy", policy_act(best), env))
         if plain_env.has_attr("guide_action"):
             acts.append(("guide", guide_act, plain_env))

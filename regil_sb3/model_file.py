@@ -1,0 +1,196 @@
+"""Models as SB3 writes them, opened without running what strangers may have put in.
+
+* ``checked_model`` - a file's bytes, once everything pickled in it is found to be of known kinds
+
+SB3 pickles what JSON cannot hold: spaces, schedules, the policy's class. Unpickling calls what a
+file names: here it may name what a model of this package needs, and call what puts numbers
+together.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+import json
+import pickle
+import zipfile
+from os import PathLike
+from pathlib import Path
+from types import BuiltinFunctionType, FunctionType
+from typing import Any, BinaryIO, ClassVar
+
+import numpy as np
+
+__all__ = ["checked_model"]
+
+_INFLATED = 4  # times a file's own size: SB3 does not compress
+_SLACK = 1 << 20  # bytes
+
+_CALLED = {
+    "collections": {"OrderedDict", "deque"},
+    "numpy": {"dtype"},
+    **{  # the first as NumPy 1 calls it
+        f"numpy.{core}.{module}": {name}
+        for core in ("core", "_core")
+        for module, name in (("multiarray", "scalar"), ("numeric", "_frombuffer"))
+    },
+    "numpy.random._pickle": {"__bit_generator_ctor", "__generator_ctor"},
+    "numpy.random.bit_generator": {"__pyx_unpickle_SeedSequence"},
+    "stable_baselines3.common.type_aliases": {"TrainFrequencyUnit"},
+}
+"""What a file may call: it puts numbers together that the file itself holds."""
+
+_MADE = {
+    "gymnasium.spaces.box": {"Box"},
+    "gymnasium.spaces.dict": {"Dict"},
+    "gymnasium.spaces.discrete": {"Discrete"},
+    "gymnasium.spaces.multi_binary": {"MultiBinary"},
+    "gymnasium.spaces.multi_discrete": {"MultiDiscrete"},
+    "regil_sb3.bc_schedule": {"BySuccess"},
+    "stable_baselines3.common.noise": {"NormalActionNoise", "OrnsteinUhlenbeckActionNoise"},
+    "stable_baselines3.common.type_aliases": {"TrainFreq"},
+    "stable_baselines3.common.utils": {"ConstantSchedule", "FloatSchedule", "LinearSchedule"},
+}
+"""What it may make an empty one of, and then fill."""
+
+_NAMED = {
+    "numpy.random._mt19937": {"MT19937"},
+    "numpy.random._pcg64": {"PCG64"},
+    "numpy.random.bit_generator": {"SeedSequence"},
+    "regil_sb3.policies": {"ConvEncoder", "ImagePolicy", "ResNet18Encoder"},
+    "regil_sb3.relabelling": {
+        "EpisodeRewardDictReplayBuffer",
+        "EpisodeRewardFrameReplayBuffer",
+        "EpisodeRewardNStepReplayBuffer",
+        "EpisodeRewardReplayBuffer",
+    },
+    "regil_sb3.replay_buffer": {"FrameReplayBuffer"},
+    "stable_baselines3.common.buffers": {"DictReplayBuffer", "NStepReplayBuffer", "ReplayBuffer"},
+    "stable_baselines3.common.torch_layers": {"CombinedExtractor", "FlattenExtractor", "NatureCNN"},
+    "stable_baselines3.td3.policies": {"CnnPolicy", "MultiInputPolicy", "TD3Policy"},
+    "torch.nn.modules.activation": {"ELU", "GELU", "LeakyReLU", "ReLU", "SiLU", "Tanh"},
+    "torch.optim.adam": {"Adam"},
+    "torch.optim.adamw": {"AdamW"},
+    "torch.optim.sgd": {"SGD"},
+}
+"""What it may name, and no more."""
+
+
+def checked_model(path: str | PathLike[str] | BinaryIO) -> BinaryIO:
+    """Read a model's file, and refuse one that holds more than a model needs.
+
+    Args:
+        path: the file (".zip" is added where it is missing, as SB3 does), or an open one.
+
+    Returns:
+        its bytes, which may be loaded.
+
+    Raises:
+        ValueError: it is no such file, is damaged, would grow far beyond its size, or names a class
+            or a function that is not known to be harmless.
+        OSError: it cannot be read.
+    """
+    if isinstance(path, (str, PathLike)):
+        file = Path(path)
+        if not file.exists() and file.suffix != ".zip":
+            file = file.with_name(f"{file.name}.zip")
+        name, content = str(file), file.read_bytes()
+    else:
+        name, content = str(getattr(path, "name", "the model")), path.read()
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            inflated = sum(member.file_size for member in archive.infolist())
+            if inflated > _INFLATED * len(content) + _SLACK:
+                raise ValueError(f"its parts claim {inflated} bytes, the file has {len(content)}")
+            if (damaged := archive.testzip()) is not None:
+                raise ValueError(f"its part {damaged!r} is damaged")
+            data = json.loads(archive.read("data"))
+        if not isinstance(data, dict):
+            raise ValueError("its settings are no dictionary")
+        for key, value in data.items():
+            if isinstance(value, dict) and ":serialized:" in value:
+                _check_pickle(key, value[":serialized:"])
+    except (zipfile.BadZipFile, KeyError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{name} is no model of Stable-Baselines3, or damaged: {error}") from None
+    except (ValueError, RecursionError, NotImplementedError) as error:
+        raise ValueError(f"{name} is not loaded: {error}") from None
+    return io.BytesIO(content)
+
+
+def _check_pickle(key: str, text: Any) -> None:
+    try:
+        pickled = base64.b64decode(text)
+    except (TypeError, binascii.Error) as error:
+        raise ValueError(f"{key!r} is damaged ({error})") from None
+    try:
+        _Checked(io.BytesIO(pickled)).load()
+    except _RefusedError as refused:
+        raise ValueError(
+            f"{key!r} names {refused}, which a model does not need and which could run code; if "
+            "you trust whoever made the file, load it with trust=True (--trust)"
+        ) from None
+    except Exception as error:  # whatever a damaged pickle may lead to
+        raise ValueError(f"{key!r} is damaged ({type(error).__name__}: {error})") from None
+
+
+class _RefusedError(Exception):
+    pass
+
+
+_SCALAR = np.float64(0).__reduce__()[0]
+_Unpickler: Any = pickle._Unpickler  # the one in Python, whose steps can be looked at
+
+
+class _Checked(_Unpickler):  # type: ignore[misc]
+    """Does what a pickle says, as far as `_CALLED`, `_MADE` and `_NAMED` go."""
+
+    dispatch: ClassVar[dict[int, Any]] = dict(_Unpickler.dispatch)
+
+    def find_class(self, module: str, name: str) -> Any:
+        if not any(name in known.get(module, ()) for known in (_CALLED, _MADE, _NAMED)):
+            raise _RefusedError(f"{module}.{name}")
+        return super().find_class(module, name)
+
+    def _check(self, known: dict[str, set[str]]) -> None:
+        """The object below the arguments must be one of those; not one that says it is."""
+        it = self.stack[-2]
+        if not any(
+            it is super(_Checked, self).find_class(module, name)
+            for module, names in known.items()
+            if module == getattr(it, "__module__", None)
+            for name in names
+        ):
+            raise _RefusedError(f"a call of {it!r}")
+
+    def load_reduce(self) -> None:
+        self._check(_CALLED)
+        arguments = self.stack[-1]
+        if self.stack[-2] is _SCALAR and len(arguments[1]) != arguments[0].itemsize:
+            raise _RefusedError(f"a number of {arguments[0].itemsize} bytes")
+        super().load_reduce()
+
+    def load_newobj(self) -> None:
+        self._check(_MADE)
+        super().load_newobj()
+
+    def load_build(self) -> None:
+        if isinstance(it := self.stack[-2], (type, FunctionType, BuiltinFunctionType)):
+            raise _RefusedError(f"a change of {it!r}")
+        super().load_build()
+
+    def _refuse(self) -> None:
+        raise _RefusedError("another way to call")
+
+    dispatch[pickle.REDUCE[0]] = load_reduce
+    dispatch[pickle.NEWOBJ[0]] = load_newobj
+    dispatch[pickle.BUILD[0]] = load_build
+    for _opcode in (
+        pickle.NEWOBJ_EX,
+        pickle.OBJ,
+        pickle.INST,
+        pickle.EXT1,
+        pickle.EXT2,
+        pickle.EXT4,
+    ):
+        dispatch[_opcode[0]] = _refuse
