@@ -35,7 +35,6 @@ Mirror = Literal["auto", 1, -1]
 
 _REACHED = 0.3  # of a full action: a place of the path counts as reached
 _AHEAD = 10  # places ahead of the next that may be reached before it
-_SETTLE = 0.1  # s that a calibration move is given to come to rest
 _WORST_RATIO = 0.95  # a registration that explains less is not believed
 _KICK_EVERY = 10  # steps of a disturbed episode, on average
 _DISTURBED = 0.5  # of a full action: a replay that was disturbed by no more is a replay
@@ -63,6 +62,9 @@ class Servo:
         mirror: +1, or -1 where the picture is mirrored against the action axes, or "auto": both are
             tried, and successes decide.
         control_rate: actions a second, for how long moves take to come to rest.
+        settle_time: s that a calibration move is given to come to rest.
+        rotation_dims: dimensions that turn the hand, as deltas: a place of the path that takes more
+            than one step must not turn it more than once.
         disturbance: in every other episode `disturbed` pushes the hand off its way now and then, by
             up to so many action units, so that who learns from `action` sees how to come back; 0:
             never.
@@ -83,6 +85,8 @@ class Servo:
         plane: Iterable[float] = (10.0, 10.0, 0.5),
         mirror: Mirror = "auto",
         control_rate: float | None = None,
+        settle_time: float = 0.1,
+        rotation_dims: Iterable[int] = (),
         disturbance: float = 0.0,
         seed: int | None = None,
     ) -> None:
@@ -99,6 +103,8 @@ class Servo:
         self._limit = np.minimum(-low, high)[self._dims].astype(float)
         deltas = np.clip(actions[:, self._dims].astype(float), -self._limit, self._limit)
         self._path = Path(deltas, None if gripper_dim is None else actions[:, gripper_dim])
+        self._rotations = list(rotation_dims)
+        self._turns: Floats = np.cumsum(actions[:, self._rotations].astype(float), axis=0)
         self._mirrors = (1, -1) if mirror == "auto" else (mirror,)
         self._rng = np.random.default_rng(seed)
         self._low, self._high = low, high
@@ -111,7 +117,7 @@ class Servo:
             gripper_dim,
             float(self._plane.max()),
             self._mirrors,
-            max(2, math.ceil(_SETTLE * (control_rate or 40.0))),
+            max(2, math.ceil(settle_time * (control_rate or 40.0))),
         )
         self.cameras: dict[int, Pinhole] = {}
         self._ways = Ways((), self.grasp is not None)
@@ -140,6 +146,7 @@ class Servo:
     _followed: bool  # whether every action was the guide's
     _at: int  # the place of the path that the hand is on its way to
     _hand: Floats  # (3,) action units from the start
+    _turned: Floats  # (rotation dims,) action units, by how much it has been turned
     _kick: Floats  # (3,) action units that the hand is still to be pushed
 
     def reset(
@@ -201,6 +208,7 @@ class Servo:
             return None
         action: NDArray[np.float32] = self._actions[min(self._at, len(self._actions) - 1)].copy()
         action[self._dims] = np.clip(self._target() - self._hand, -self._limit, self._limit)
+        action[self._rotations] = self._turns[min(self._at, len(self._turns) - 1)] - self._turned
         clipped: NDArray[np.float32] = np.clip(action, self._low, self._high)
         return clipped
 
@@ -225,6 +233,7 @@ class Servo:
         if self._way.kind != "plain":
             delta = np.asarray(action, float)[self._dims]
             self._hand = self._hand + np.clip(delta, -self._limit, self._limit)
+            self._turned = self._turned + np.asarray(action, float)[self._rotations]
             self._at = self._next_place()
             self._next_kick()
 
@@ -363,6 +372,7 @@ class Servo:
         self._followed = True
         self._at = 0
         self._hand = np.zeros(3)
+        self._turned = np.zeros(len(self._rotations))
         self._kick = np.zeros(3)
         self._way = self._ways.plain
         self.target_shift, self.place_shift = np.zeros(3), np.zeros(3)

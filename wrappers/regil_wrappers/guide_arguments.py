@@ -96,6 +96,8 @@ _DECLARED = {
     "mirror": "auto",
 }
 
+_OF_THE_ARM = ("control_rate", "settle_time", "rotation_dims")
+
 
 def make_servo(
     said: dict[str, Any],
@@ -123,9 +125,9 @@ def make_servo(
         chosen["gripper_dim"] = None
     box = cast("gym.spaces.Box", space)
     low, high = box.low.astype(np.float32), box.high.astype(np.float32)
-    rate = said.get("control_rate")
+    chosen |= {name: said[name] for name in _OF_THE_ARM if name in said}
     try:
-        return Servo(size, actions, low, high, control_rate=rate, disturbance=disturbance, **chosen)
+        return Servo(size, actions, low, high, disturbance=disturbance, **chosen)
     except ValueError as error:
         if any(value is not None for value in declared.values()):
             raise
