@@ -22,7 +22,7 @@ import regil_sb3  # registers the environments  # noqa: F401
 from regil_sb3.bench_rewards import TASKS
 from regil_sb3.envs import METAWORLD_TASKS
 from regil_sb3.recording import EVALUATION_SEEDS, record_expert
-from regil_sb3.settings import presets
+from regil_sb3.settings import make_settings, presets
 from regil_sb3.timing import Timed
 
 __all__ = ["DISTURBANCES", "Collected", "Guided", "guide", "main", "success_buffer", "table"]
@@ -90,7 +90,7 @@ class Guided:
     """One task, one demonstration, one disturbance.
 
     Attributes:
-        task: Meta-World's name.
+        task: Meta-World's name, or the id of an environment.
         seed: the demonstration's.
         disturbance: of `DISTURBANCES`.
         plain: whether plain replay succeeded, goal by goal.
@@ -123,7 +123,7 @@ def guide(
     """Replay plainly and corrected at the same goals; the correction calibrates first.
 
     Args:
-        tasks: Meta-World's names.
+        tasks: Meta-World's names, or ids of environments with a scripted expert.
         episodes: goals, the first of those that evaluations use.
         seeds: first seeds tried for the demonstrations; each gives one.
         disturbances: of `DISTURBANCES`.
@@ -133,7 +133,7 @@ def guide(
     """
     for task in tasks:
         for seed in seeds:
-            demo = record_expert(f"regil/metaworld-{task}-v0", seed=seed)
+            demo = record_expert(_env_id(task), seed, _env_kwargs(task))
             for disturbance in disturbances:
                 yield _guided(task, seed, demo, disturbance, episodes)
 
@@ -144,8 +144,17 @@ def _arguments() -> dict[str, Any]:
     return dict(entry["regil_wrappers.RetrievalGuideWrapper"])
 
 
+def _env_id(task: str) -> str:
+    return task if "/" in task else f"regil/metaworld-{task}-v0"
+
+
+def _env_kwargs(task: str) -> dict[str, Any]:
+    """As `regil train` makes it: LIBERO's time limits depend on the task."""
+    return make_settings(_env_id(task)).env_kwargs
+
+
 def _make(task: str, disturbance: str) -> gym.Env[Any, Any]:
-    env = gym.make(f"regil/metaworld-{task}-v0")
+    env = gym.make(_env_id(task), **_env_kwargs(task))
     if disturbance == "camera":
         _turn_camera(env.unwrapped)
     elif disturbance in _CHANGES or disturbance == "distractor":
@@ -170,9 +179,9 @@ def _turn_camera(env: Any) -> None:
 
 def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int) -> Guided:
     goals = range(EVALUATION_SEEDS, EVALUATION_SEEDS + n)
-    reference = gym.make(f"regil/metaworld-{task}-v0")
+    reference = _make(task, "none")
     reference.reset(seed=int(demo.metadata["seed"]))
-    home = _places(reference)
+    home = _targets(reference)
     reference.close()
 
     plain = RetrievalGuideWrapper(_make(task, disturbance), demo)
@@ -189,9 +198,9 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     corrected, errors = [], []
     for goal in goals:
         corrected.append(_play(env, goal))
-        repeat = env.unwrapped.metadata["regil"]["action_repeat"]  # 1 cm each
-        for shift, moved in zip(_believed(env), _places(env) - home, strict=False):
-            errors.append(float(np.linalg.norm((shift * repeat - 100 * moved)[:2])))
+        believed = [shift * env.unwrapped.metadata["regil"]["step_cm"] for shift in _believed(env)]
+        for shift, moved in zip(believed, _targets(env) - home, strict=False):
+            errors.append(float(np.linalg.norm((shift - 100 * moved)[:2])))
     seconds = time.perf_counter() - start - timed.seconds
     said = (env.calibration() or {}).get("why", "")
     env.close()
@@ -200,10 +209,10 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     )
 
 
-def _places(env: gym.Env[Any, Any]) -> npt.NDArray[np.float64]:
-    """(1 or 2, 3) m: the places of what Meta-World's tasks move about, from the simulator."""
-    vector = env.unwrapped._sim._last_rand_vec  # type: ignore[attr-defined]
-    return np.array(vector, float).reshape(-1, 3)
+def _targets(env: gym.Env[Any, Any]) -> npt.NDArray[np.float64]:
+    """(n, 3) m: where what the task is about stands, from the simulator."""
+    places: npt.NDArray[np.float64] = env.unwrapped.targets()  # type: ignore[attr-defined]
+    return places
 
 
 def _believed(env: RetrievalGuideWrapper[Any, Any]) -> list[npt.NDArray[np.float64]]:
@@ -243,7 +252,7 @@ class Collected:
     """What a guide leaves in a success buffer.
 
     Attributes:
-        task: Meta-World's name.
+        task: Meta-World's name, or the id of an environment.
         seed: of demonstration and episodes.
         steps: agent steps guided, calibration included.
         plain: transitions of successful episodes, plain replay.
@@ -266,13 +275,13 @@ def success_buffer(
     The guide is the default preset's, pushed off its way now and then as in training.
 
     Args:
-        tasks: Meta-World's names.
+        tasks: Meta-World's names, or ids of environments with a scripted expert.
         seeds: of demonstration and episodes.
         steps: agent steps of the warm-up.
     """
     for task in tasks:
         for seed in seeds:
-            demo = record_expert(f"regil/metaworld-{task}-v0", seed=seed)
+            demo = record_expert(_env_id(task), seed, _env_kwargs(task))
             kept = [
                 _collect(RetrievalGuideWrapper(_make(task, "none"), demo, **own), seed, steps)
                 for own in ({}, _arguments())
@@ -349,10 +358,15 @@ def main(name: str, **options: Any) -> None:
     for option in options:
         if option not in known:
             raise ValueError(f"--{option} is no option of the table {name!r}: {', '.join(known)}")
-    for option, choices in (("tasks", METAWORLD_TASKS), ("disturbances", DISTURBANCES)):
-        for value in options.get(option, ()):
-            if value not in choices:
-                raise ValueError(f"--{option} {value}: choose from {', '.join(choices)}")
+    for value in options.get("tasks", ()):
+        if _env_id(value) not in gym.registry:
+            known_tasks = ", ".join(METAWORLD_TASKS)
+            raise ValueError(f"--tasks {value}: choose from {known_tasks}, or an environment's id")
+    for value in options.get("disturbances", ()):
+        if value not in DISTURBANCES:
+            raise ValueError(f"--disturbances {value}: choose from {', '.join(DISTURBANCES)}")
+    if "camera" in options.get("disturbances", ()) and any("/" in t for t in options["tasks"]):
+        raise ValueError("--disturbances camera: only Meta-World's cameras can be turned")
     for option in ("episodes", "steps"):
         if options.get(option, 1) < 1:
             raise ValueError(f"--{option} {options[option]}: at least 1 is needed")

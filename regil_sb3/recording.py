@@ -12,10 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from regil_wrappers.demonstration import Demonstration
 
-__all__ = ["EVALUATION_SEEDS", "record_expert"]
+from regil_sb3.envs import EVALUATION_SEEDS
 
-EVALUATION_SEEDS = 1_000_000
-"""Seeds from here on belong to evaluation: a demonstration must not know what it is tested on."""
+__all__ = ["EVALUATION_SEEDS", "record_expert"]
 
 _PACKAGES = ("gymnasium", "metaworld", "mujoco", "numpy", "regil-sb3", "regil-wrappers")
 

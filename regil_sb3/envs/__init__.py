@@ -4,7 +4,12 @@ Gymnasium from 1.0 on reads no entry points: whoever wants the ids imports the p
 imports a simulator, torch or stable-baselines3.
 """
 
-__all__ = ["METAWORLD_TASKS", "register_envs"]
+from regil_sb3.envs.libero_tasks import LIBERO_TASKS
+
+__all__ = ["EVALUATION_SEEDS", "LIBERO_TASKS", "METAWORLD_TASKS", "register_envs"]
+
+EVALUATION_SEEDS = 1_000_000
+"""Seeds from here on belong to evaluation: a demonstration must not know what it is tested on."""
 
 METAWORLD_TASKS = (
     "assembly",
@@ -62,21 +67,22 @@ METAWORLD_TASKS = (
 
 
 def register_envs() -> None:
-    """Register `regil/metaworld-<task>-v0` for every task of `METAWORLD_TASKS`.
+    """Register `regil/metaworld-<task>-v0` and `regil/libero-<task>-v0` for every task.
 
     The time limit is not Gymnasium's: it sits inside the environment (`max_steps`), where it
     counts agent steps under the action repeat and truncates.
     """
     from gymnasium.envs.registration import register, registry
 
-    for task in METAWORLD_TASKS:
-        env_id = f"regil/metaworld-{task}-v0"
-        if env_id not in registry:  # calling it twice is harmless and warns of nothing
-            register(
-                env_id,
-                entry_point="regil_sb3.envs.metaworld:MetaWorldEnv",
-                kwargs={"task": task},
-            )
+    simulators = {
+        "metaworld": ("regil_sb3.envs.metaworld:MetaWorldEnv", METAWORLD_TASKS),
+        "libero": ("regil_sb3.envs.libero:LiberoEnv", LIBERO_TASKS),
+    }
+    for simulator, (entry_point, tasks) in simulators.items():
+        for task in tasks:
+            env_id = f"regil/{simulator}-{task}-v0"
+            if env_id not in registry:  # calling it twice is harmless and warns of nothing
+                register(env_id, entry_point=entry_point, kwargs={"task": task})
 
 
 register_envs()

@@ -183,6 +183,7 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
                 "plane": [10 / action_repeat, 10 / action_repeat, 0.5 / action_repeat],
                 # Rows flipped alone mirror a camera that hangs upside down.
                 "mirror": -1 if self._upside_down else 1,
+                "step_cm": 1.0 * action_repeat,
             },
         }
 
@@ -283,6 +284,10 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
             The picture, or `None` where `render_mode` is `None`.
         """
         return None if self.render_mode is None else self.encoder_frame(self._render_size)
+
+    def targets(self) -> npt.NDArray[np.float64]:
+        """Where what the task moves about stands, (1 or 2, 3) m."""
+        return np.array(self._sim._last_rand_vec, float).reshape(-1, 3)
 
     def close(self) -> None:
         """Free the renderer."""

@@ -34,9 +34,17 @@ class Renderer:
         camera: its number in the model.
         size: height and width in pixels that pictures will mostly have.
         hidden: groups of geoms that are not drawn.
+        sites: whether sites are drawn.
     """
 
-    def __init__(self, model: Any, camera: int, size: int, hidden: Sequence[int] = ()) -> None:
+    def __init__(
+        self,
+        model: Any,
+        camera: int,
+        size: int,
+        hidden: Sequence[int] = (),
+        sites: bool = False,
+    ) -> None:
         import mujoco  # type: ignore[import-untyped]
 
         self._mujoco = mujoco
@@ -49,7 +57,8 @@ class Renderer:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._options = mujoco.MjvOption()
-        self._options.sitegroup[:] = 0  # sites are marks, and the goal is one of them
+        if not sites:  # they are marks, and in Meta-World the goal is one of them
+            self._options.sitegroup[:] = 0
         self._options.geomgroup[list(hidden)] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,9 @@ def import_robosuite() -> Any:
         macros.MUJOCO_GPU_RENDERING = False
         macros.FILE_LOGGING_LEVEL, macros.CONSOLE_LOGGING_LEVEL = None, "ERROR"
         sys.modules["robosuite.macros"] = macros
-    import robosuite  # type: ignore[import-untyped]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its own logging, which is older than Python's
+        import robosuite  # type: ignore[import-untyped]
 
     if not robosuite.__version__.startswith("1.4."):
         raise ImportError(f"robosuite {robosuite.__version__} is not 1.4: {INSTALL}")

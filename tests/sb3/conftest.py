@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -26,3 +27,13 @@ def demo_path(demo: Demonstration, tmp_path_factory: pytest.TempPathFactory) -> 
     path: Path = tmp_path_factory.mktemp("demos") / "reach.hdf5"
     demo.save(path)
     return str(path)
+
+
+@pytest.fixture(scope="session")
+def libero_assets() -> Path:
+    """LIBERO's assets, of the tasks whose tests run here."""
+    beside = Path(__file__).resolve().parents[3] / "shared/libero_assets"
+    folder = Path(os.environ.setdefault("REGIL_LIBERO_ASSETS", str(beside)))
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not there: REGIL_LIBERO_ASSETS names LIBERO's assets")
+    return folder

@@ -363,6 +363,7 @@ def test_metadata_describes_this_instance(make):
         "gripper_dim": 3,
         "plane": [5.0, 5.0, 0.25],
         "mirror": -1,
+        "step_cm": 2.0,
     }
     ours = slow.metadata["regil"]
     assert (ours["camera"], ours["image_size"], ours["control_rate"]) == ("corner3", [64, 64], 20.0)
