@@ -1,4 +1,7 @@
-"""The command line: ``regil record | convert | doctor | train | evaluate | report | bench``."""
+"""The command line, `regil`.
+
+``regil record | convert | doctor | train | evaluate | report | push | bench``.
+"""
 
 from __future__ import annotations
 
@@ -107,6 +110,11 @@ def _parser() -> argparse.ArgumentParser:
     report = commands.add_parser("report", help="make the HTML page of a run")
     report.add_argument("run", type=Path)
     report.add_argument("-o", "--out", type=Path, help="file (RUN/report.html)")
+
+    push = commands.add_parser("push", help="upload a run folder to the Hugging Face hub")
+    push.add_argument("run", type=Path)
+    push.add_argument("repo", metavar="REPO", help="OWNER/NAME on the hub")
+    push.add_argument("--private", action="store_true", help="for you alone")
 
     bench = commands.add_parser("bench", help="measure, as ratios in one run")
     bench.add_argument(
@@ -245,6 +253,8 @@ def _train(args: argparse.Namespace) -> None:
 
 def _evaluate(run: Path, episodes: int, trust: bool = False) -> None:
     from regil_sb3 import process, training
+    from regil_sb3.evaluation import METHODS
+    from regil_sb3.model_card import write_card
 
     process.keep_freed_memory()
     if episodes < 1:
@@ -255,21 +265,25 @@ def _evaluate(run: Path, episodes: int, trust: bool = False) -> None:
         print(f"\nnot evaluated; later: regil evaluate {run}", file=sys.stderr)
         raise
     print(f"\nSuccess over {episodes} unseen episodes, {results['steps']} steps of learning:")
-    for name, title in (
-        ("policy", "policy"),
-        ("best_policy", "best policy"),
-        ("corrected_guide", "corrected guide"),
-        ("guide", "guided replay"),
-        ("bc", "BC on the demo"),
-    ):
+    for name, title in METHODS.items():
         if name in results:
             print(f"  {title:<15} {results[name]['success']:.2f}")
+    write_card(run)
 
 
 def _report(run: Path, out: Path | None) -> None:
     from regil_sb3.report import write_report
 
     print(f"report: {write_report(run, out)}")
+
+
+def _push(run: Path, repo: str, private: bool) -> None:
+    from regil_sb3.model_card import push
+
+    def show(path: Path) -> None:
+        print(f"  {path.name:<40} {path.stat().st_size / 1e6:8.2f} MB")
+
+    print(push(run, repo, private, show))
 
 
 def _doctor(args: argparse.Namespace) -> int:
@@ -307,6 +321,8 @@ def main(argv: list[str] | None = None) -> int:
             _evaluate(args.run, args.episodes, args.trust)
         elif args.command == "report":
             _report(args.run, args.out)
+        elif args.command == "push":
+            _push(args.run, args.repo, args.private)
         elif args.command == "bench":
             from regil_sb3 import bench
 

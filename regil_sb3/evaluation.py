@@ -24,6 +24,15 @@ from stable_baselines3.common.vec_env import VecEnv
 EVALUATION_SEED = 1_000_000
 SELECTION_SEED = 2_000_000
 
+METHODS = {
+    "policy": "policy",
+    "best_policy": "best policy",
+    "corrected_guide": "corrected guide",
+    "guide": "guided replay",
+    "bc": "BC on the demo",
+}
+"""What ``evaluation.json`` may hold, and what people call it."""
+
 Act = Callable[[Any, VecEnv], npt.NDArray[Any]]
 
 

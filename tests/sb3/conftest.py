@@ -14,6 +14,9 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "wrappers"))
 
 import toy_env
 
+from regil_sb3 import training
+from regil_sb3.cli import main
+
 torch.set_num_threads(1)
 
 
@@ -37,3 +40,21 @@ def libero_assets() -> Path:
     if not folder.is_dir():
         pytest.skip(f"{folder} is not there: REGIL_LIBERO_ASSETS names LIBERO's assets")
     return folder
+
+
+@pytest.fixture(scope="session")
+def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder of `regil train` in seconds; tests leave it as they found it."""
+    folder = tmp_path_factory.mktemp("runs")
+    toy_env.record().save(folder / "reach.hdf5")
+    tiny = {"correction": "none", "register": "false", "disturbance": 0, "warmup_steps": 25,
+            "learning_starts": 10, "bc_pretrain_steps": 2, "buffer_size": 200, "batch_size": 4,
+            "eval_episodes": 1}  # fmt: skip
+    words = ["train", "--env", "ToyReach-v0", "--demo", str(folder / "reach.hdf5")]
+    words += ["--out", str(folder / "run"), "--steps", "200", "--episodes", "2"]
+    for key, value in tiny.items():
+        words += ["--set", f"{key}={value}"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "BC_UPDATES", 3)
+        assert main(words) == 0
+    return folder / "run"
