@@ -255,7 +255,7 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
     Known at the episode's end: "ot" and "tot", (temporal) optimal transport. Each step then returns
     0 (with ``mode="add"`` the environment's reward), and ``info`` of the last one holds what is to
     be *added* to the rewards that were returned: ``info["retrieval"]["episode_rewards"]``, (steps,)
-    float32, weighted, times ``episode_scale`` of the first episode of all (ROT's 10 / |sum|,
+    float32, weighted, times ``episode_scale`` of the first episode of all (ROT's ``10 / |sum|``,
     unweighted). An algorithm that does not read it learns from zeros: with Stable-Baselines3 use
     ``regil_sb3.relabelling``'s replay buffers. Time limits belong inside this wrapper.
 
