@@ -1,5 +1,6 @@
 # Each target makes the virtual environment .venv, or brings it up to date, by itself.
 PYTHON ?= python3
+OLDEST_PYTHON ?= python3.10
 # On Linux, the registry's torch comes with several GB of CUDA. For the CPU build, name PyTorch's
 # own index of CPU builds (pytorch.org, "Get started"):
 #   make run TORCH_INDEX=...
@@ -11,7 +12,7 @@ BIN := .venv/bin
 STAMP := .venv/installed
 SETTINGS := constraints.txt setup.cfg pyproject.toml wrappers/setup.cfg wrappers/pyproject.toml
 
-.PHONY: run test lint clean
+.PHONY: run test lint docs dist test-oldest clean
 .DELETE_ON_ERROR:
 
 run: $(STAMP)
@@ -25,8 +26,24 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy regil_sb3 wrappers/regil_wrappers
 
+docs: $(STAMP)
+	$(BIN)/python -m sphinx -W --keep-going docs build/docs
+
+# Wheels and sdists of both, the same to the bit from the same commit
+dist: $(STAMP)
+	$(BIN)/python .ci/dist.py dist
+	$(BIN)/python -m twine check --strict dist/*
+
+# The tests with the oldest versions that setup.cfg allows, in .venv-oldest
+test-oldest:
+	test -x .venv-oldest/bin/python || $(OLDEST_PYTHON) -m venv .venv-oldest
+	.venv-oldest/bin/python -m pip install --quiet -c constraints-oldest.txt \
+	    $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
+	.venv-oldest/bin/python -m pip install --quiet -c constraints-oldest.txt -e ./wrappers -e '.[tests]'
+	.venv-oldest/bin/python -m pytest -m "not slow and not packaging"
+
 clean:
-	rm -rf .venv build dist *.egg-info wrappers/build wrappers/dist wrappers/*.egg-info
+	rm -rf .venv .venv-oldest build dist *.egg-info wrappers/build wrappers/dist wrappers/*.egg-info
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
