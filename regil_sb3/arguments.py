@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch as th
 
 _CHOICES = {
     "bc_loss": ("mse", "nll"),
@@ -54,8 +55,32 @@ def check_arguments(given: dict[str, Any]) -> None:
         _check_number("reward_scale", given["reward_scale"], _NUMBER, 0.0, np.inf)
     if given["bc_steps"] is not None:
         _check_number("bc_steps", given["bc_steps"], (int,), 1, np.inf)
+    if not callable(given["learning_rate"]):
+        _check_number("learning_rate", given["learning_rate"], _NUMBER, 0.0, np.inf)
+    _check_train_freq(given["train_freq"])
+    _check_device(given["device"])
     if given["q_coef"] == 0 and given["bc_coef"] == 0:
         raise ValueError("q_coef=0 and bc_coef=0 leave the actor nothing to learn from")
+
+
+def _check_train_freq(train_freq: Any) -> None:
+    unit = "step"
+    if isinstance(train_freq, tuple | list) and len(train_freq) == 2:
+        train_freq, unit = train_freq
+    _check_number("train_freq", train_freq, (int,), 1, np.inf)
+    if unit not in ("step", "episode"):
+        raise ValueError(f"train_freq counts in {unit!r}: use 'step' or 'episode'")
+
+
+def _check_device(device: Any) -> None:
+    if device == "auto":
+        return
+    try:
+        kind = th.device(device).type
+    except (RuntimeError, TypeError):
+        raise ValueError(f"device is {device!r}: use 'auto', 'cpu' or 'cuda'") from None
+    if kind == "cuda" and not th.cuda.is_available():
+        raise ValueError(f"device is {str(device)!r} and no GPU is found: use 'cpu'")
 
 
 def _check_number(

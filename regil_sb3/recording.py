@@ -55,7 +55,10 @@ def record_expert(
             f"seeds {seed} to {seed + max_seeds - 1} must lie between 0 and "
             f"{EVALUATION_SEEDS - 1}: those above are kept for evaluation"
         )
-    env = gym.make(env_id, **(env_kwargs or {}))
+    try:
+        env = gym.make(env_id, **(env_kwargs or {}))
+    except TypeError as error:  # an argument that it does not have
+        raise ValueError(f"{env_id} cannot be made with {env_kwargs}: {error}") from error
     try:
         if not hasattr(env.unwrapped, "expert_action"):
             raise ValueError(

@@ -236,6 +236,12 @@ class TD3BC(TD3):
 
     def _setup_model(self) -> None:
         space = self.observation_space
+        takes_dicts = issubclass(self.policy_class, MultiInputPolicy)
+        if takes_dicts != isinstance(space, spaces.Dict):
+            right = "CnnPolicy or MlpPolicy" if takes_dicts else "MultiInputPolicy"
+            raise ValueError(
+                f"{self.policy_class.__name__} does not fit the observations {space}: use {right}"
+            )
         if isinstance(self.demo, str | PathLike):  # as load(..., demo=PATH) hands it over
             self.demo = Demonstration.load(self.demo)
         if self.env is not None:  # without one, what was saved with the model holds
