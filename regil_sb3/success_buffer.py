@@ -130,6 +130,15 @@ class SuccessBuffer:
             return batch, actions
         return np.stack([self._observation(e, s) for e, s in picks]), actions
 
+    def films(self) -> list[tuple[int, npt.NDArray[np.uint8] | None]]:
+        """Steps of each episode, the demonstration first, and what it looks like.
+
+        Returns:
+            the steps, and (steps, H, W, 3) uint8, of the first picture in the observations; None
+            where there is none.
+        """
+        return [(len(e), _film(e.observations)) for e in (*self._pinned, *self._episodes)]
+
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """The episodes that are not pinned as plain arrays, for ``numpy.savez``."""
         out: dict[str, npt.NDArray[Any]] = {"episodes": np.array(len(self._episodes))}
@@ -156,6 +165,14 @@ class SuccessBuffer:
             )
             self._episodes.append(_Episode(observations, state[f"{i}/actions"]))
         self._ends = np.cumsum([len(e) for e in (*self._pinned, *self._episodes)])
+
+
+def _film(observations: Observations) -> npt.NDArray[np.uint8] | None:
+    parts = observations.values() if isinstance(observations, dict) else [observations]
+    for part in parts:
+        if part.dtype == np.uint8 and part.ndim == 4 and part.shape[1] == 3:
+            return np.moveaxis(part, 1, -1)
+    return None
 
 
 def stack_frames(frames: npt.NDArray[Any], n_stack: int) -> npt.NDArray[Any]:

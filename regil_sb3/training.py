@@ -44,6 +44,7 @@ from regil_sb3.run_folder import (
     save_model,
 )
 from regil_sb3.settings import Settings
+from regil_sb3.success_films import save_films
 from regil_sb3.td3bc import TD3BC
 
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
@@ -250,6 +251,7 @@ def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> Non
         save_model(model, run / "model.zip")
         (run / "buffers.npz").unlink(missing_ok=True)
     finally:
+        save_films(model.success_buffer, run / "success_buffer.npz")
         callback.close()
         model.logger.close()
 

@@ -52,7 +52,8 @@ def rows(folder):
 
 def test_run_folder_holds_what_the_contract_names(run):
     for name in ("config.yaml", "demo.hdf5", "model.zip", "best_model.zip", "progress.csv",
-                 "report.html", "evaluation.json", "episode.hdf5"):  # fmt: skip
+                 "report.html", "evaluation.json", "episode.hdf5", "success_buffer.npz",
+                 ):  # fmt: skip
         assert (run / name).stat().st_size > 0, name
     assert list(run.glob("events.out.tfevents.*"))
     results = json.loads((run / "evaluation.json").read_text())
