@@ -17,7 +17,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True)
 
-    record = commands.add_parser("record", help="record the scripted expert of an environment")
+    record = commands.add_parser(
+        "record", help="record the scripted expert of an environment, or a person"
+    )
     record.add_argument("env", help="id of the environment, e.g. regil/metaworld-button-press-v0")
     record.add_argument("-o", "--out", type=Path, help="file (demos/<id after the slash>.hdf5)")
     record.add_argument("--seed", type=int, default=0, help="first seed to try (0)")
@@ -27,6 +29,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     record.add_argument(
         "--env-kwargs", nargs="*", default=[], metavar="KEY=VALUE", help="e.g. size=128"
+    )
+    record.add_argument(
+        "--teleop",
+        choices=["keyboard", "gamepad", "spacemouse"],
+        help="steer by hand in a window (keyboard, where there is no scripted expert)",
+    )
+    record.add_argument(
+        "--live", action="store_true", help="by hand: time passes while nothing is pressed, too"
     )
 
     convert = commands.add_parser("convert", help="a demonstration from one format to another")
@@ -153,10 +163,10 @@ def _record(
     env_kwargs: dict[str, Any] | None = None,
     encoder_frame_size: int | None = None,
 ) -> None:
+    """Record the scripted expert."""
     from regil_sb3.recording import record_expert
 
-    if path.exists():
-        raise ValueError(f"{path} exists already: choose another file with -o, or remove it")
+    _refuse_existing(path)
     demo = record_expert(
         env,
         seed=seed,
@@ -164,13 +174,48 @@ def _record(
         encoder_frame_size=encoder_frame_size,
         progress=lambda line: print(line, file=sys.stderr),
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
     demo.save(path)
     tried = demo.metadata["seeds_tried"]
     print(
         f"{path}: {len(demo)} frames, seed {demo.metadata['seed']}, "
         f"{tried} {'seed' if tried == 1 else 'seeds'} tried"
     )
+
+
+def _refuse_existing(path: Path) -> None:
+    if path.exists():
+        raise ValueError(f"{path} exists already: choose another file with -o, or remove it")
+
+
+def _record_as_asked(args: argparse.Namespace) -> None:
+    from regil_sb3.recording import NoExpertError
+    from regil_sb3.settings import pairs
+
+    path = args.out or default_demo(args.env)
+    env_kwargs = pairs(args.env_kwargs)
+    if args.size is not None:
+        env_kwargs["size"] = args.size
+    _refuse_existing(path)
+    if args.teleop is None:
+        try:
+            _record(args.env, path, args.seed, env_kwargs, args.encoder_size)
+            return
+        except NoExpertError:
+            pass  # a person takes its place
+    from regil_sb3.teleoperation import teleoperate
+
+    device = args.teleop or "keyboard"
+    try:
+        demo = teleoperate(args.env, device, args.seed, env_kwargs, args.encoder_size, args.live)
+    except ValueError as error:
+        if args.teleop is not None:
+            raise
+        raise ValueError(f"no scripted expert, and not to be recorded by hand: {error}") from error
+    if demo is None:
+        print("nothing was recorded", file=sys.stderr)
+        return
+    demo.save(path)
+    print(f"{path}: {len(demo)} frames, seed {demo.metadata['seed']}")
 
 
 def _convert(args: argparse.Namespace) -> None:
@@ -304,13 +349,7 @@ def main(argv: list[str] | None = None) -> int:
 
     try:
         if args.command == "record":
-            from regil_sb3.settings import pairs
-
-            out = args.out or default_demo(args.env)
-            env_kwargs = pairs(args.env_kwargs)
-            if args.size is not None:
-                env_kwargs["size"] = args.size
-            _record(args.env, out, args.seed, env_kwargs, args.encoder_size)
+            _record_as_asked(args)
         elif args.command == "convert":
             _convert(args)
         elif args.command == "doctor":

@@ -1,4 +1,8 @@
-"""Record an environment's scripted expert as a `Demonstration`."""
+"""Record episodes as a `Demonstration`.
+
+* ``Recorder`` - takes down one episode of an environment
+* ``record_expert`` - its scripted expert's; ``NoExpertError`` where there is none
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,13 @@ from regil_wrappers.demonstration import Demonstration
 
 from regil_sb3.envs import EVALUATION_SEEDS
 
-__all__ = ["EVALUATION_SEEDS", "record_expert"]
+__all__ = ["EVALUATION_SEEDS", "NoExpertError", "Recorder", "check_seeds", "record_expert"]
 
 _PACKAGES = ("gymnasium", "metaworld", "mujoco", "numpy", "regil-sb3", "regil-wrappers")
+
+
+class NoExpertError(ValueError):
+    """An environment has no scripted expert."""
 
 
 def record_expert(
@@ -47,35 +55,28 @@ def record_expert(
         images, pictures of its `image_size`, with the observations beside them.
 
     Raises:
-        ValueError: where the environment has no scripted expert, a seed belongs to evaluation,
-            or no seed leads to success.
+        NoExpertError: where the environment has no scripted expert.
+        ValueError: where a seed belongs to evaluation, or no seed leads to success.
     """
-    if seed < 0 or max_seeds < 1 or seed + max_seeds > EVALUATION_SEEDS:
-        raise ValueError(
-            f"seeds {seed} to {seed + max_seeds - 1} must lie between 0 and "
-            f"{EVALUATION_SEEDS - 1}: those above are kept for evaluation"
-        )
-    try:
-        env = gym.make(env_id, **(env_kwargs or {}))
-    except TypeError as error:  # an argument that it does not have
-        raise ValueError(f"{env_id} cannot be made with {env_kwargs}: {error}") from error
+    check_seeds(seed, max_seeds)
+    env = made(env_id, env_kwargs)
     try:
         if not hasattr(env.unwrapped, "expert_action"):
-            raise ValueError(
+            raise NoExpertError(
                 f"{env_id} has no scripted expert (no expert_action()): "
-                "give a demonstration recorded elsewhere"
+                "record it by hand (regil record --teleop keyboard), or elsewhere"
             )
-        if not isinstance(env.action_space, gym.spaces.Box):
-            raise ValueError(f"{env_id} has actions {env.action_space}: only Box can be recorded")
+        recorder = Recorder(env, encoder_frame_size)
         for tried in range(1, max_seeds + 1):
             now = seed + tried - 1
-            episode = _play(env, now, encoder_frame_size)
-            solved = episode["successes"][-1]
+            recorder.begin(now)
+            while not recorder.over:
+                recorder.step(env.unwrapped.expert_action())
             if progress is not None:
-                outcome = "solved" if solved else "not solved"
-                progress(f"seed {now}: {outcome} after {len(episode['actions'])} steps")
-            if solved:
-                return Demonstration(**episode, metadata=_metadata(env, env_id, now, tried))
+                outcome = "solved" if recorder.solved else "not solved"
+                progress(f"seed {now}: {outcome} after {len(recorder)} steps")
+            if recorder.solved:
+                return recorder.demonstration(env_id, seeds_tried=tried)
         raise ValueError(
             f"the scripted expert of {env_id} solved none of the seeds {seed} to "
             f"{seed + max_seeds - 1}: try another seed, or more steps an episode"
@@ -84,59 +85,160 @@ def record_expert(
         env.close()
 
 
-def _play(env: gym.Env[Any, Any], seed: int, encoder_frame_size: int | None) -> dict[str, Any]:
-    """Play one episode: the arrays of a `Demonstration`, by name."""
-    ours: Any = env.unwrapped
-    space = env.action_space
-    assert isinstance(space, gym.spaces.Box)
-    pixels = env.observation_space.dtype == np.uint8 and len(env.observation_space.shape or ()) == 3
+def made(env_id: str, env_kwargs: dict[str, Any] | None) -> gym.Env[Any, Any]:
+    """The environment.
 
-    observations: list[npt.NDArray[Any]] = []
-    frames: list[npt.NDArray[np.uint8]] = []
-    encoder_frames: list[npt.NDArray[np.uint8]] = []
-    actions: list[npt.NDArray[np.float32]] = []
-    successes = [False]
-
-    def see(observation: npt.NDArray[Any]) -> None:
-        observations.append(observation)
-        if not pixels:
-            frames.append(ours.encoder_frame(ours.metadata["regil"]["image_size"][0]))
-        if encoder_frame_size is not None:
-            encoder_frames.append(ours.encoder_frame(encoder_frame_size))
-
-    observation, _ = env.reset(seed=seed)
-    see(observation)
-    over = False
-    while not over:
-        action = np.clip(ours.expert_action(), space.low, space.high).astype(np.float32)
-        observation, _, terminated, truncated, info = env.step(action)
-        see(observation)
-        actions.append(action)
-        successes.append(bool(info["is_success"]))
-        over = successes[-1] or terminated or truncated
-    return {
-        "frames": np.stack(observations if pixels else frames),
-        "actions": np.stack(actions),
-        "observations": None if pixels else np.stack(observations),
-        "encoder_frames": np.stack(encoder_frames) if encoder_frames else None,
-        "successes": np.array(successes),
-    }
+    Raises:
+        ValueError: if it does not take these arguments.
+    """
+    try:
+        return gym.make(env_id, **(env_kwargs or {}))
+    except TypeError as error:  # an argument that it does not have
+        raise ValueError(f"{env_id} cannot be made with {env_kwargs}: {error}") from error
 
 
-def _metadata(env: gym.Env[Any, Any], env_id: str, seed: int, tried: int) -> dict[str, Any]:
-    space = env.action_space
-    assert isinstance(space, gym.spaces.Box)
-    ours = env.unwrapped.metadata.get("regil", {})
-    kept = ("camera", "render", "image_size", "action_repeat", "control_rate")
-    return {
-        **{name: ours[name] for name in kept if name in ours},
-        "env_id": env_id,
-        "action_low": space.low.tolist(),
-        "action_high": space.high.tolist(),
-        "seed": seed,
-        "seeds_tried": tried,
-        # only what took part in this recording
-        "versions": {
-            name: version(name) for name in _PACKAGES if name.replace("-", "_") in sys.modules
-        },
-    }
+def check_seeds(seed: int, many: int = 1) -> None:
+    """Refuse seeds that belong to evaluation.
+
+    Raises:
+        ValueError: naming those that do not.
+    """
+    if seed < 0 or many < 1 or seed + many > EVALUATION_SEEDS:
+        raise ValueError(
+            f"seeds {seed} to {seed + many - 1} must lie between 0 and "
+            f"{EVALUATION_SEEDS - 1}: those above are kept for evaluation"
+        )
+
+
+class Recorder:
+    """Takes down one episode of an environment, one after the other.
+
+    Pictures are the observations; of dict observations the one that is a picture; else the
+    environment's ``encoder_frame`` in its ``image_size``, or what it renders. Observations that are
+    no pictures are kept beside them.
+
+    Args:
+        env: without retrieval wrappers.
+        encoder_frame_size: height and width (pixels) of the larger pictures to keep beside the
+            frames; None keeps none.
+
+    Raises:
+        ValueError: where actions are not continuous, or there are no pictures.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], encoder_frame_size: int | None = None) -> None:
+        name = env.spec.id if env.spec else type(env.unwrapped).__name__
+        if not isinstance(env.action_space, gym.spaces.Box):
+            raise ValueError(f"{name} has actions {env.action_space}: only Box can be recorded")
+        self.env = env
+        self.space = env.action_space
+        self._ours: Any = env.unwrapped
+        self._encoder_size = encoder_frame_size
+        space = env.observation_space
+        parts = space.spaces if isinstance(space, gym.spaces.Dict) else {}
+        self._keys = [key for key, part in parts.items() if is_picture(part)]
+        self._pixels = is_picture(space)
+        draws = hasattr(self._ours, "encoder_frame")
+        if encoder_frame_size is not None and not draws:
+            raise ValueError(f"{name} draws no larger pictures (no encoder_frame())")
+        if not (self._pixels or self._keys or draws or env.render_mode == "rgb_array"):
+            raise ValueError(
+                f"{name} gives no pictures: make it with --env-kwargs render_mode=rgb_array"
+            )
+
+    def __len__(self) -> int:
+        """Steps taken so far."""
+        return len(self.actions)
+
+    def begin(self, seed: int) -> None:
+        """Begin the episode of a seed."""
+        self.seed = seed
+        self._observations: list[Any] = []
+        self.frames: list[npt.NDArray[np.uint8]] = []
+        self._encoder_frames: list[npt.NDArray[np.uint8]] = []
+        self.actions: list[npt.NDArray[np.float32]] = []
+        self.successes = [False]
+        self.over = self.timed_out = False
+        observation, _ = self.env.reset(seed=seed)
+        self._see(observation)
+
+    def step(self, action: npt.NDArray[np.floating[Any]]) -> None:
+        """Execute an action, clipped to the action space, and take down what came of it."""
+        clipped = np.clip(action, self.space.low, self.space.high).astype(np.float32)
+        observation, _, terminated, truncated, info = self.env.step(clipped)
+        self._see(observation)
+        self.actions.append(clipped)
+        self.successes.append(bool(info.get("is_success", terminated)))
+        self.timed_out = truncated
+        self.over = self.solved or terminated or truncated
+
+    @property
+    def solved(self) -> bool:
+        """Whether the environment says so of the last frame."""
+        return self.successes[-1]
+
+    def _see(self, observation: Any) -> None:
+        if self._pixels:
+            frame = observation
+        elif self._keys:
+            frame = observation[self._keys[0]]
+            observation = {k: v for k, v in observation.items() if k not in self._keys}
+        else:
+            frame = self.drawn()
+        if not self._pixels:
+            self._observations.append(observation)
+        self.frames.append(np.array(frame))
+        if self._encoder_size is not None:
+            self._encoder_frames.append(self._ours.encoder_frame(self._encoder_size))
+
+    def drawn(self, size: int | None = None) -> npt.NDArray[np.uint8]:
+        """The scene as it is now, (H, W, 3) uint8; in so many pixels where it can be drawn so."""
+        if hasattr(self._ours, "encoder_frame"):
+            size = size or self._ours.metadata["regil"]["image_size"][0]
+            return np.asarray(self._ours.encoder_frame(size), np.uint8)
+        if self.env.render_mode == "rgb_array":
+            return np.asarray(self.env.render(), np.uint8)
+        return self.frames[-1]
+
+    def demonstration(self, env_id: str, **metadata: Any) -> Demonstration:
+        """The episode so far.
+
+        Args:
+            env_id: the environment's.
+            metadata: more of it.
+        """
+        observations: Any = self._observations or None
+        if observations is not None and isinstance(observations[0], dict):
+            observations = {
+                key: np.stack([o[key] for o in observations]) for key in observations[0]
+            } or None
+        elif observations is not None:
+            observations = np.stack(observations)
+        ours = self.env.unwrapped.metadata.get("regil", {})
+        kept = ("camera", "render", "image_size", "action_repeat", "control_rate")
+        return Demonstration(
+            frames=np.stack(self.frames),
+            actions=np.stack(self.actions),
+            observations=observations,
+            encoder_frames=np.stack(self._encoder_frames) if self._encoder_frames else None,
+            successes=np.array(self.successes),
+            metadata={
+                **{name: ours[name] for name in kept if name in ours},
+                "env_id": env_id,
+                "action_low": self.space.low.tolist(),
+                "action_high": self.space.high.tolist(),
+                "seed": self.seed,
+                # only what took part in this recording
+                "versions": {
+                    name: version(name)
+                    for name in _PACKAGES
+                    if name.replace("-", "_") in sys.modules
+                },
+                **metadata,
+            },
+        )
+
+
+def is_picture(space: gym.Space[Any]) -> bool:
+    """Whether these are RGB pictures, uint8 (H, W, 3)."""
+    return isinstance(space, gym.spaces.Box) and space.dtype == np.uint8 and space.shape[2:] == (3,)
