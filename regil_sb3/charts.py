@@ -28,6 +28,7 @@ class Line(NamedTuple):
         points: (x, y) pairs, finite.
         style: "solid", "dashed", "dotted" or "dots".
         right: Whether it is read on the right axis.
+        spread: (x, low, high) of an area around it, finite.
     """
 
     label: str
@@ -35,6 +36,7 @@ class Line(NamedTuple):
     points: Sequence[Point]
     style: str = "solid"
     right: bool = False
+    spread: Sequence[tuple[float, float, float]] = ()
 
 
 def _ticks(low: float, high: float, count: int = 5) -> list[float]:
@@ -73,7 +75,8 @@ def line_chart(
         percent: Whether the left axis is a rate, drawn from 0 to 100 %.
 
     Returns:
-        HTML: an ``svg`` and its legend; "" if no series has points.
+        HTML: an ``svg`` and its legend; "" if no series has points. Its ``data-plot`` says where
+        the axes are: left, top, right, bottom and the x value at the right.
     """
     lines = [line for line in lines if line.points]
     if not lines:
@@ -104,6 +107,7 @@ def line_chart(
         if not here:
             continue
         values = [y for line in here for _, y in line.points]
+        values += [y for line in here for _, *both in line.spread for y in both]
         as_rate = percent and not right
         ticks = (
             [i / 5 for i in range(6)] if as_rate else _ticks(min(*values, 0.0), max(*values, 0.0))
@@ -127,6 +131,11 @@ def line_chart(
         for line in here:
             where = [(across(x), up(y)) for x, y in line.points]
             style = f'style="--c:var(--{line.color})"'
+            if line.spread:
+                rim = [(x, high) for x, _, high in line.spread]
+                rim += [(x, low) for x, low, _ in reversed(line.spread)]
+                corners = " ".join(f"{across(x):.1f},{up(y):.1f}" for x, y in rim)
+                parts.append(f'<polygon class="spread" {style} points="{corners}"/>')
             if line.style != "dots":
                 dots = " ".join(f"{x:.1f},{y:.1f}" for x, y in where)
                 parts.append(f'<polyline class="series {line.style}" {style} points="{dots}"/>')
@@ -147,6 +156,7 @@ def line_chart(
     )
     names = html.escape(", ".join(label for label, _, _ in entries), quote=True)
     return (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{names}">'
+        f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{names}" '
+        f'data-plot="{_LEFT} {_TOP} {right_edge} {bottom} {x_high:g}">'
         f'{"".join(parts)}</svg><div class="legend">{legend}</div>'
     )

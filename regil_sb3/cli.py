@@ -117,9 +117,16 @@ def _parser() -> argparse.ArgumentParser:
         help="the models may name anything, and so run code: your own policies and encoders",
     )
 
-    report = commands.add_parser("report", help="make the HTML page of a run")
-    report.add_argument("run", type=Path)
-    report.add_argument("-o", "--out", type=Path, help="file (RUN/report.html)")
+    report = commands.add_parser(
+        "report", help="make the HTML page of a run, or one that compares several"
+    )
+    report.add_argument("run", type=Path, nargs="+", metavar="RUN")
+    report.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        help="file (RUN/report.html; of several, comparison.html beside the first)",
+    )
 
     push = commands.add_parser("push", help="upload a run folder to the Hugging Face hub")
     push.add_argument("run", type=Path)
@@ -293,7 +300,7 @@ def _train(args: argparse.Namespace) -> None:
             print(f"\nthe model is in {run}: regil evaluate {run}", file=sys.stderr)
         raise
     _evaluate(run, args.episodes)
-    _report(run, None)
+    _report([run], None)
 
 
 def _evaluate(run: Path, episodes: int, trust: bool = False) -> None:
@@ -316,10 +323,16 @@ def _evaluate(run: Path, episodes: int, trust: bool = False) -> None:
     write_card(run)
 
 
-def _report(run: Path, out: Path | None) -> None:
-    from regil_sb3.report import write_report
+def _report(runs: list[Path], out: Path | None) -> None:
+    if len(runs) == 1:
+        from regil_sb3.report import write_report
 
-    print(f"report: {write_report(run, out)}")
+        print(f"report: {write_report(runs[0], out)}")
+        return
+    from regil_sb3.comparison import write_comparison
+
+    out = out or runs[0].resolve().parent / "comparison.html"
+    print(f"comparison: {write_comparison(runs, out)}")
 
 
 def _push(run: Path, repo: str, private: bool) -> None:

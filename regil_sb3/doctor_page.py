@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 
 from regil_wrappers import Demonstration
 
-from regil_sb3.files import replacing
+from regil_sb3 import page
 from regil_sb3.findings import Finding
 from regil_sb3.pictures import data_uri, film_player
 
@@ -46,21 +44,16 @@ def write_page(
         raise ValueError(f"--html '{path}' is a folder: give the name of an HTML file")
     verdicts = {f.verdict for f in findings}
     worst = next((v for v in ("wrong", "warning") if v in verdicts), "ok")
-    template = Template(files("regil_sb3").joinpath("report.html").read_text("utf-8"))
     rows = "".join(map(_row, findings))
     film = f"<h2>Demonstration</h2>{film_player(demo, None, None)}"
     cards = (f"<table>{rows}</table>", film)
-    body = "".join(f'<section class="card wide">{card}</section>' for card in cards)
-    page = template.substitute(
-        title=html.escape(title),
-        headline=f'<p style="color:{_COLOURS[worst]}"><b>{_SUMMARY[worst]}</b></p>',
-        missing="",
-        body=body,
-        footer="Made by regil doctor.",
+    page.write_page(
+        path,
+        title,
+        f'<p style="color:{_COLOURS[worst]}"><b>{_SUMMARY[worst]}</b></p>',
+        "".join(f'<section class="card wide">{card}</section>' for card in cards),
+        "Made by regil doctor.",
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
-        file.write(page.encode())
 
 
 def _row(finding: Finding) -> str:

@@ -1,5 +1,6 @@
-"""What a correcting guide sees in one episode: where the target went, and the path it makes of it.
+"""What a correcting guide sees in one episode: what went where, and the path it makes of it.
 
+* ``Moved`` - one thing that moved
 * ``GuideView`` - pixels of an episode's first picture
 * ``guide_view`` - from a demonstration, that picture and a calibration
 * ``guide_picture`` - the two first pictures with all that, as inline SVG
@@ -12,23 +13,34 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration
+from regil_wrappers.apart import Apart, register_apart, taken_up
 from regil_wrappers.correction import Servo
 from regil_wrappers.pinhole import nearest_to_path
-from regil_wrappers.registration import register
+from regil_wrappers.registration import Displacement, register
 
 from regil_sb3.pictures import data_uri
 
-__all__ = ["GuideView", "guide_picture", "guide_view"]
+__all__ = ["GuideView", "Moved", "guide_picture", "guide_view"]
 
 Pixels = npt.NDArray[np.float64]
 
+_COLOURS = ("#6cabff", "#8fcf6c")  # of each thing that moved
+_NAMES = ("blue", "green")
 
-class GuideView(NamedTuple):
-    """Pixels (x, y) of the pictures, unless said otherwise."""
 
-    moved: Pixels  # (2, 2): where what moved stood, and where it was found
+class Moved(NamedTuple):
+    """One thing that moved, in pixels (x, y) unless said otherwise."""
+
+    what: str
+    seen: Pixels  # (2, 2): where it stood, and where it was found
     believed: Pixels  # (2,): where the camera would see it after `shift`
     shift: npt.NDArray[np.float64]  # (3,) action units
+
+
+class GuideView(NamedTuple):
+    """Pixels (x, y) of the pictures."""
+
+    things: list[Moved]  # the target; or what is taken up and where it is brought
     path: Pixels  # (T, 2): the demonstrated path of the hand
     corrected: Pixels  # (T, 2): the corrected one
 
@@ -37,6 +49,9 @@ def guide_view(
     demo: Demonstration, first: npt.NDArray[np.uint8], calibration: dict[str, Any]
 ) -> GuideView | None:
     """What the guide makes of an episode's first picture; None where it would not correct.
+
+    Where pictures show that what is taken up and the place to which it is brought moved apart, both
+    are in it.
 
     Args:
         demo: with actions.
@@ -53,23 +68,38 @@ def guide_view(
     if dims is None or plane is None:
         raise ValueError("the calibration says neither translation_dims nor plane")
     height, width = demo.frames.shape[1:3]
-    servo = Servo((height, width), demo.actions, low, high, dims, None, plane)
+    gripper = calibration.get("gripper_dim")  # older ones do not say it
+    servo = Servo((height, width), demo.actions, low, high, dims, gripper, plane)
     servo.load_state(calibration)
     found = register(demo.frames[0], first)
     if not servo.cameras or found is None:
         return None
-    servo.reset(found, kind="corrected")
+    apart: Apart | None = None
+    if servo.grasp is not None and any(way[0] == "released" for way in calibration["ways"]):
+        apart = register_apart(demo.frames[0], first, taken_up(demo.frames, servo.grasp))
+        # What cannot be believed leaves the place where it stood, and is one target then
+        servo.reset(found, apart, kind="released")
+    if apart is None or not servo.place_shift.any():
+        servo.reset(found, kind="corrected")
     camera = servo.camera
     if camera is None:
         return None
-    place = nearest_to_path(camera, found.point, servo.demonstrated_path())
-    return GuideView(
-        moved=np.stack([found.point, np.add(found.point, found.shift)]),
-        believed=camera.project(place + servo.target_shift),
-        shift=servo.target_shift,
-        path=camera.project(servo.demonstrated_path()),
-        corrected=camera.project(servo.corrected_path()),
-    )
+    path = servo.demonstrated_path()
+
+    def moved(what: str, one: Displacement, shift: Pixels) -> Moved:
+        place = nearest_to_path(camera, one.point, path)
+        seen = np.stack([one.point, np.add(one.point, one.shift)])
+        return Moved(what, seen, camera.project(place + shift), shift)
+
+    if servo.kind == "released" and apart is not None:
+        named = (
+            ("what is taken up", apart.taken, servo.target_shift),
+            ("the place to which it is brought", apart.place, servo.place_shift),
+        )
+        things = [moved(what, one, shift) for what, one, shift in named if one is not None]
+    else:
+        things = [moved("the target", found, servo.target_shift)]
+    return GuideView(things, camera.project(path), camera.project(servo.corrected_path()))
 
 
 def guide_picture(demo: Demonstration, first: npt.NDArray[np.uint8], view: GuideView | None) -> str:
@@ -95,20 +125,23 @@ def guide_picture(demo: Demonstration, first: npt.NDArray[np.uint8], view: Guide
         f'href="{data_uri(picture, ".png")}"/>'
         for x, picture in ((0.0, demo.frames[0]), (right, first))
     )
-    marks = (
-        line(view.path, 0, "#ff9c5a")
-        + ring(view.moved[0], 0, "#ff9c5a")
-        + line(view.moved, right, "#ffffff")
-        + ring(view.moved[0], right, "#ff9c5a")
-        + ring(view.believed, right, "#6cabff")
-        + line(view.corrected, right, "#6cabff")
-    )
-    x, y, z = view.shift
+    marks = line(view.path, 0, "#ff9c5a") + line(view.corrected, right, _COLOURS[0])
+    said = []
+    for thing, colour, name in zip(view.things, _COLOURS, _NAMES, strict=False):
+        marks += (
+            ring(thing.seen[0], 0, colour)
+            + ring(thing.seen[0], right, "#ff9c5a")
+            + line(thing.seen, right, "#ffffff")
+            + ring(thing.believed, right, colour)
+        )
+        x, y, z = thing.shift
+        said.append(f"{thing.what} ({name}) by ({x:.1f}, {y:.1f}, {z:.1f})")
     return (
-        f'<svg class="matrix" viewBox="0 0 {2 * width + 4} {height}" role="img" '
+        f'<svg viewBox="0 0 {2 * width + 4} {height}" role="img" '
         f'aria-label="what the guide sees">{images}{marks}</svg>'
-        '<p class="soft small">Left: the first picture of the demonstration, where what moved '
-        "stood (ring) and the hand's path (orange). Right: the first picture of the evaluation "
-        "episode; white: how far it was found to have moved; blue: where the target is believed "
-        f"to be, and the corrected path. Displacement ({x:.1f}, {y:.1f}, {z:.1f}) action units.</p>"
+        '<p class="soft small">Left: the first picture of the demonstration, with a ring where '
+        "what moved stood, and the hand's path (orange). Right: the first picture of the "
+        "evaluation episode; white: from where it stood (orange ring) to where it was found; "
+        "rings: where it is believed to be; blue line: the corrected path. Moved, in action "
+        f"units: {'; '.join(said)}.</p>"
     )

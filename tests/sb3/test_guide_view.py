@@ -13,10 +13,9 @@ from regil_sb3.guide_view import guide_picture, guide_view
 from regil_sb3.report import write_report
 
 
-@pytest.fixture(scope="module")
-def calibrated():
-    demo = toy_camera.record()
-    env = RetrievalGuideWrapper(toy_camera.ToyCamera(), demo, correction="servo")
+def calibrate(task):
+    demo = toy_camera.record(task=task)
+    env = RetrievalGuideWrapper(toy_camera.ToyCamera(task), demo, correction="servo")
     seed = 0
     while env.calibration() is None:
         _, over = env.reset(seed=(seed := seed + 1)), False
@@ -26,6 +25,33 @@ def calibrated():
     return demo, json.loads(json.dumps(env.calibration()))
 
 
+@pytest.fixture(scope="module")
+def calibrated():
+    return calibrate("touch")
+
+
+def test_two_things_that_moved_apart():
+    demo, calibration = calibrate("bring")
+    env = toy_camera.ToyCamera("bring")
+    both = 0
+    for seed in range(6):
+        first, _ = env.reset(seed=seed)
+        view = guide_view(demo, first, calibration)
+        if len(view.things) < 2:
+            continue
+        both += 1
+        taken, place = view.things
+        assert (taken.what, place.what)[1] == "the place to which it is brought"
+        assert np.linalg.norm((taken.shift - (env.square - toy_camera.HOME))[:2]) < 0.6
+        assert np.linalg.norm((place.shift - (env.goal - toy_camera.GOAL))[:2]) < 1.6
+        assert np.abs(place.believed - toy_camera.project(env.goal)[0]).max() < 8
+        picture = guide_picture(demo, first, view)
+        assert picture.count("<circle") == 6
+    assert both >= 4
+    older = {name: value for name, value in calibration.items() if name != "gripper_dim"}
+    assert len(guide_view(demo, first, older).things) == 1
+
+
 def test_the_target_is_believed_where_it_is(calibrated):
     demo, calibration = calibrated
     env = toy_camera.ToyCamera()
@@ -33,8 +59,9 @@ def test_the_target_is_believed_where_it_is(calibrated):
         first, _ = env.reset(seed=seed)
         view = guide_view(demo, first, calibration)
         true = toy_camera.project(env.square)[0]
-        assert np.abs(view.believed - true).max() < 6  # of the square, the part that was seen
-        np.testing.assert_allclose(view.shift, env.square - toy_camera.HOME, atol=0.8)
+        (target,) = view.things
+        assert np.abs(target.believed - true).max() < 6  # of the square, the part that was seen
+        np.testing.assert_allclose(target.shift, env.square - toy_camera.HOME, atol=0.8)
         assert view.path.shape == view.corrected.shape == (len(demo.actions), 2)
         assert np.abs(view.corrected[-1] - true).max() < 4
     picture = guide_picture(demo, first, view)

@@ -1,81 +1,32 @@
 """The report of a synthetic run: what the page has, what it says is missing, what is refused."""
 
 import base64
-import csv
 import json
 import re
 from html.parser import HTMLParser
 
 import cv2
+import made_run
 import numpy as np
 import pytest
 import yaml
+from made_run import buffer_of, film
 from regil_wrappers import Demonstration
 
 from regil_sb3 import report
 from regil_sb3.charts import Line, line_chart
+from regil_sb3.episode_alignment import align
+from regil_sb3.page import flat
 from regil_sb3.report import write_report
+from regil_sb3.success_buffer import SuccessBuffer
+from regil_sb3.success_films import load_films, save_films
 
 EVIL = "</script><script>alert('x')</script>&\"'"
 
 
-def _film(length, tint, **metadata):
-    """A bright square that moves to the right over a fixed background."""
-    frames = np.full((length, 36, 36, 3), 40, np.uint8)
-    frames[:, ::2] += np.uint8(tint)
-    for t in range(length):
-        x = 28 * t // length
-        frames[t, 10:18, x : x + 8] = 180 + t
-    actions = np.zeros((length - 1, 4), np.float32)
-    return Demonstration(frames, actions=actions, metadata={"control_rate": 40, **metadata})
-
-
-def _row(step):
-    return {
-        "time/total_timesteps": step,
-        "time/guided": int(step <= 4000),
-        "rollout/success_rate": step / 20_000,
-        "rollout/retrieval_reward": -200 + step / 100,
-        "rollout/env_reward": step / 50,
-        "eval/success_rate": step / 16_000 if step % 5000 == 0 else "",
-        "train/bc_coef": 2 - step / 8000,
-        "success_buffer/steps": step / 3,
-        "success_buffer/episodes": step // 300,
-    }
-
-
-def _result(successes):
-    return {"success": float(np.mean(successes)), "episodes": 20, "successes": successes}
-
-
 @pytest.fixture
 def run(tmp_path):
-    run = tmp_path / "run"
-    run.mkdir()
-    config = {
-        "env": "regil/metaworld-button-press-v0",
-        "encoder": "pixels",
-        "k": 3,
-        "horizon": 4,
-        "hyperparams": {"bc_coef": 2.0, "note": EVIL},
-    }
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
-    with (run / "progress.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, _row(0))
-        writer.writeheader()
-        writer.writerows(_row(step) for step in range(500, 15_001, 500))
-    evaluation = {
-        "steps": 15_000,
-        "frames": 30_000,
-        "seeds": list(range(1_000_000, 1_000_020)),
-        "policy": _result([True] * 19 + [False]),
-        "guide": _result([True] * 5 + [False] * 15),
-        "bc": _result([False] * 14 + [True] * 6),
-    }
-    (run / "evaluation.json").write_text(json.dumps(evaluation))
-    _film(30, 0).save(run / "demo.hdf5")
-    _film(40, 6, success=True, seed=1_000_000).save(run / "episode.hdf5")
-    return run
+    return made_run.run(tmp_path / "run", note=EVIL)
 
 
 class _Page(HTMLParser):
@@ -126,8 +77,8 @@ def test_a_whole_run_is_one_page_with_everything(run):
         "Reward over steps",
         "Success buffer",
         "Episodes",
-        "Demonstration and evaluation episode",
-        "Alignment",
+        "An evaluation episode beside the demonstration",
+        "What the success buffer holds",
         "Configuration",
     ):
         assert f"<h2>{title}</h2>" in text
@@ -135,7 +86,7 @@ def test_a_whole_run_is_one_page_with_everything(run):
     assert 'title="seed 1000019: failure"' in text
     assert "19 of 20<br>" in text
     assert "unseen episodes after 15,000 steps (30,000 frames)" in text
-    assert "Missing from this run" not in text
+    assert "Missing from this page" not in text
     assert list(run.glob("*.tmp")) == []
 
 
@@ -153,7 +104,9 @@ def test_both_themes_define_every_colour(run):
     light, dark = re.findall(r":root \{(.*?)\}", text, re.DOTALL)
     used = set(re.findall(r"var\(--([a-z_]+)\)", text)) - {"c"}
     for theme in (light, dark):
-        assert used | {"corrected_guide"} == set(re.findall(r"--([a-z_]+):", theme))
+        assert used | {"corrected_guide", *(f"m{i}" for i in range(6))} == set(
+            re.findall(r"--([a-z_0-9]+):", theme)
+        )
 
 
 def test_everything_read_from_files_is_escaped(run):
@@ -163,22 +116,22 @@ def test_everything_read_from_files_is_escaped(run):
     evaluation = json.loads((run / "evaluation.json").read_text())
     evaluation["seeds"] = [EVIL] * 20
     (run / "evaluation.json").write_text(json.dumps(evaluation))
-    _film(40, 6, success=EVIL, control_rate=25).save(run / "episode.hdf5")
+    film(40, 6, success=EVIL, control_rate=25).save(run / "episode.hdf5")
     text, page = _page(run)
     assert "alert('x')" not in text
-    assert page.count["script"] == 2
+    assert page.count["script"] == 3
     assert f"ReGIL: {EVIL}" in page.words
 
 
 def test_films_are_whole_sprite_sheets(run):
     text, _ = _page(run)
-    data = json.loads(re.search(r'id="film-data">(.*?)</script>', text).group(1))
+    data, kept = (json.loads(d) for d in re.findall(r'class="player-data">(.*?)</script>', text))
     assert data["rate"] == 40
     assert [clip["length"] for clip in data["clips"]] == [30, 40]
-    for clip, film in zip(data["clips"], ("demo", "episode"), strict=True):
+    for clip, name in zip(data["clips"], ("demo", "episode"), strict=True):
         code = np.frombuffer(base64.b64decode(clip["sprite"].split(",")[1]), np.uint8)
         sheet = cv2.cvtColor(cv2.imdecode(code, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-        frames = Demonstration.load(run / f"{film}.hdf5").frames
+        frames = Demonstration.load(run / f"{name}.hdf5").frames
         for i, frame in enumerate(frames):
             y, x = divmod(i, clip["columns"])
             tile = sheet[36 * y : 36 * (y + 1), 36 * x : 36 * (x + 1)].astype(int)
@@ -186,11 +139,45 @@ def test_films_are_whole_sprite_sheets(run):
     # The episode moves at 3/4 of the demonstration's pace.
     assert data["ends"][0] <= 1
     assert data["ends"][-1] >= 27
+    assert [path[-1] for path in data["paths"]] == [[t, j] for t, j in enumerate(data["ends"])]
+    assert len(data["rewards"]) == 39
+    assert [clip["length"] for clip in kept["clips"]] == [16] * 5
+
+
+def test_pictures_of_the_successbuffer_of(tmp_path):
+    save_films(buffer_of(60), tmp_path / "kept.npz")
+    kept = load_films(tmp_path / "kept.npz")
+    assert kept.lengths == list(range(20, 80))
+    assert (len(kept.films), kept.shown[0], kept.shown[-1]) == (24, 0, 59)
+    np.testing.assert_array_equal(kept.films[-1][[0, -1]], film(79, 0).frames[[0, -1]])
+    save_films(SuccessBuffer(5), tmp_path / "none.npz")
+    assert load_films(tmp_path / "none.npz").lengths == []
+    states = SuccessBuffer(50)
+    states.add(np.zeros((9, 3), np.float32), np.zeros((9, 2), np.float32))
+    save_films(states, tmp_path / "states.npz")
+    assert (load_films(tmp_path / "states.npz").lengths, kept.shown[:2]) == ([9], [0, 3])
+
+
+def test_rewards_are_the_runs_own(run):
+    demo = Demonstration.load(run / "demo.hdf5")
+    wrapper = {"regil_wrappers.RetrievalRewardWrapper": {"reward": "progress", "register": True}}
+    aligned = align(demo, demo, {"encoder": "pixels", "env_wrapper": [wrapper]})
+    assert aligned.reward == "progress"
+    assert aligned.rewards[-1] == 0  # an exact replay ends at the demonstration's end
+    assert min(np.diff(aligned.rewards)) > -0.01
+    assert aligned.rewards[0] < -0.8
+    late = align(
+        demo,
+        demo,
+        {"env_wrapper": ["x", {"y": None}, {"z.RetrievalRewardWrapper": {"reward": "ot"}}]},
+    )
+    assert len(late.rewards) == len(demo) - 1
+    assert max(late.rewards) < 0
 
 
 def test_alignment_is_the_retrievers(run):
     demo = Demonstration.load(run / "demo.hdf5")
-    aligned = report._align(demo, demo, {"encoder": "pixels", "k": 3, "horizon": 4})
+    aligned = align(demo, demo, {"encoder": "pixels", "k": 3, "horizon": 4})
     assert aligned.ends == list(range(30))
     assert aligned.distances.shape == (30, 30)
     assert np.diag(aligned.distances).max() == 0
@@ -213,18 +200,22 @@ def test_what_is_missing_is_said(run, names, said):
     for name in names:
         (run / name).unlink()
     text, _ = _page(run)
-    assert "Missing from this run" in text
+    assert "Missing from this page" in text
     assert said in text
 
 
 @pytest.mark.parametrize(
-    "name", ["config.yaml", "progress.csv", "evaluation.json", "demo.hdf5", "episode.hdf5"]
+    "name",
+    [
+        *("config.yaml", "progress.csv", "evaluation.json", "demo.hdf5", "episode.hdf5"),
+        *("success_buffer.npz", "calibration.json"),
+    ],
 )
 @pytest.mark.parametrize("content", [b"", b"\x00\x89{[", b"[1, 2]", b'{"policy": 3, "seeds": 4'])
 def test_a_broken_file_costs_its_part_of_the_page_only(run, name, content):
     (run / name).write_bytes(content)
     text, _ = _page(run)
-    assert "Missing from this run" in text
+    assert "Missing from this page" in text
     assert "<h2>Episodes</h2>" in text or name == "evaluation.json"
 
 
@@ -253,8 +244,8 @@ def test_an_encoder_that_is_not_here_costs_the_alignment_only(run):
     (run / "config.yaml").write_text("encoder: no-such-encoder\n")
     text, _ = _page(run)
     assert "no-such-encoder" in text
-    assert "<h2>Alignment</h2>" not in text
-    assert "<h2>Demonstration and evaluation episode</h2>" in text
+    assert "distances and warping path" not in text
+    assert "<h2>An evaluation episode beside the demonstration</h2>" in text
 
 
 def test_out_is_where_the_page_goes(run, tmp_path):
@@ -284,19 +275,13 @@ def test_guided_stretches_are_joined():
 
 def test_nested_settings_become_one_table():
     settings = {"a": {"b": {"c": 1}, "empty": {}}, "wrap": [{"x": {"k": 5}}, "y"], "flat": [1, 2]}
-    assert report._flat(settings) == [
+    assert flat(settings) == [
         ("a.b.c", 1),
         ("a.empty", {}),
         ("wrap.0.x.k", 5),
         ("wrap.1", "y"),
         ("flat", [1, 2]),
     ]
-
-
-def test_wilson_interval_is_the_published_one():
-    # Newcombe (1998), Table I, score method without continuity correction: 15/148 and 0/20.
-    assert report._wilson(15, 148) == pytest.approx((6.24, 16.05), abs=0.1)
-    assert report._wilson(0, 20) == pytest.approx((0.0, 16.11), abs=0.01)
 
 
 @pytest.mark.parametrize("values", [[0.0], [5.0, 5.0], [-1e-9, 1e9], [-2.0, -1.0], [0.0, 0.0]])

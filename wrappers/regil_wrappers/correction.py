@@ -275,6 +275,7 @@ class Servo:
             "cameras": [camera.as_dict() for camera in self.cameras.values()],
             "ways": self._ways.as_list(),
             "translation_dims": self._dims,
+            "gripper_dim": self._gripper,
             "plane": self._plane.tolist(),
             "why": self.why,
         }

@@ -1,0 +1,130 @@
+"""Several runs on one page: which are of one method, and how sure the difference is."""
+
+import math
+import re
+
+import made_run
+import numpy as np
+import pytest
+import yaml
+
+from regil_sb3.cli import main
+from regil_sb3.comparison import methods, write_comparison
+from regil_sb3.intervals import improvement, iqm, wilson
+from regil_sb3.run_contents import read_run
+
+OTHER = "regil/metaworld-hammer-v0"
+
+# What rliable 1.2.0 says of these: value, low, high (50,000 resamples)
+RLIABLE = {"a": (0.6, 0.35, 0.85), "b": (0.35, 0.2, 0.5)}
+SCORES = {"a": [[0.2, 0.5, 0.9], [0.4, 0.6, 1.0]], "b": [[0.1, 0.4, 0.3], [0.5, 0.2, 0.7]]}
+
+
+@pytest.fixture
+def runs(tmp_path):
+    return [
+        made_run.run(tmp_path / "a-0", films=False, solved=19),
+        made_run.run(tmp_path / "a-1", films=False, solved=17, seed=1),
+        made_run.run(tmp_path / "a-2", films=False, solved=15, env=OTHER),
+        made_run.run(tmp_path / "a-3", films=False, solved=18, env=OTHER, seed=1),
+        made_run.run(tmp_path / "b-0", films=False, solved=9, bc_coef=0.0),
+        made_run.run(tmp_path / "b-1", films=False, solved=8, seed=1, bc_coef=0.0),
+        made_run.run(tmp_path / "b-2", films=False, solved=20, env=OTHER, bc_coef=0.0),
+        made_run.run(tmp_path / "b-3", films=False, solved=2, env=OTHER, seed=1, bc_coef=0.0),
+    ]
+
+
+def test_methods_and_scores(runs, tmp_path, capsys):
+    assert main(["report", *map(str, runs)]) == 0
+    page = (tmp_path / "comparison.html").read_text("utf-8")
+    assert str(tmp_path / "comparison.html") in capsys.readouterr().out
+    assert "ReGIL: 8 runs, 2 tasks" in page
+    # the middle half of .95 .85 .75 .9 and of .45 .4 1 .1 (42.5)
+    assert re.findall(r"<b>(\d+) %</b>", page) == ["88", "43"]
+    assert page.count("4 runs, 2 tasks") == 2
+    assert "bc_coef=2.0" in page
+    assert "2.0 | 0.0" in page
+    assert "90 % (85 to 95, 2 runs)" in page  # of button-press
+    assert "17 of 20 (64 to 95 %)" in page
+    assert page.count('class="spread"') == 2
+    # on button-press none of b beats one of a, on hammer half do
+    assert re.search(r"<td>bc_coef=0.0</td><td>25 % \(\d+ to \d+ %\)", page)
+    assert "Missing from this page" not in page
+    assert "data:" not in re.sub(r"img-src data:", "", page)
+
+
+def test_what_differs_between_tasks_alone_is_no_method(runs):
+    for run in runs:
+        config = yaml.safe_load((run / "config.yaml").read_text())
+        config["preset"] = config["env"]  # a task's own section
+        config["hyperparams"]["warmup_steps"] = len(config["env"])
+        (run / "config.yaml").write_text(yaml.safe_dump(config))
+    named = methods([read_run(run) for run in runs])
+    assert {name: len(group) for name, group in named.items()} == {
+        "bc_coef=2.0": 4,
+        "bc_coef=0.0": 4,
+    }
+    config = yaml.safe_load((runs[4] / "config.yaml").read_text())
+    (runs[4] / "config.yaml").write_text(yaml.safe_dump({**config, "preset": "plain"}))
+    assert len(methods([read_run(run) for run in runs])) == 3
+    assert list(methods([read_run(run) for run in runs[:2]])) == ["runs"]
+
+
+def test_one_run_of_a_task_has_no_interval(runs, tmp_path):
+    page = write_comparison([runs[0], runs[4]], tmp_path / "page.html").read_text("utf-8")
+    assert page.count("no interval: a task with one run") == 3
+    assert "nan" not in page
+
+
+def test_what_was_not_evaluated_is_said(runs, tmp_path, capsys):
+    (runs[0] / "evaluation.json").write_text("{}")
+    page = write_comparison(runs[:3], tmp_path / "page.html").read_text("utf-8")
+    assert f"{runs[0]}: its policy is not evaluated" in page
+    assert "ReGIL: 2 runs" in page
+    assert main(["report", str(runs[0]), str(runs[0])]) == 2
+    assert "none of these runs has been evaluated" in capsys.readouterr().err
+    assert main(["report", str(runs[1]), str(tmp_path)]) == 2
+    assert "is not a run folder" in capsys.readouterr().err
+    assert main(["report", *map(str, runs[:2]), "-o", str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err
+
+
+def test_more_methods_than_colours(tmp_path, capsys):
+    many = [made_run.run(tmp_path / f"{i}", films=False, bc_coef=float(i)) for i in range(7)]
+    assert main(["report", *map(str, many)]) == 2
+    assert "7 methods (bc_coef=0.0; bc_coef=1.0;" in capsys.readouterr().err
+
+
+def test_everything_read_is_escaped(runs, tmp_path):
+    evil = "</td><script>alert(1)</script>"
+    config = yaml.safe_load((runs[0] / "config.yaml").read_text())
+    config["hyperparams"][evil] = evil
+    (runs[0] / "config.yaml").write_text(yaml.safe_dump(config | {"env": evil}))
+    page = write_comparison(runs[:2], tmp_path / "page.html").read_text("utf-8")
+    assert "<script>alert" not in page
+
+
+def test_iqm_is_rliables():
+    for name, (value, low, high) in RLIABLE.items():
+        found = iqm(SCORES[name])
+        assert found.value == pytest.approx(value, abs=1e-9)
+        assert (found.low, found.high) == pytest.approx((low, high), abs=0.02)
+
+
+def test_intervals():
+    assert iqm([[0.5, 0.5], [0.5, 0.5]]) == (0.5, 0.5, 0.5)
+    alone = iqm([[0.5], [0.7, 0.9]])
+    assert alone.value == pytest.approx(0.7)
+    assert math.isnan(alone.low)
+    better = improvement([[0.9, 0.8]], [[0.8, 0.1]])
+    assert better.value == pytest.approx((1 + 1 + 0.5 + 1) / 4)
+    assert better.low <= better.value <= better.high
+    rng = np.random.default_rng(0)
+    same = improvement([rng.random(40).tolist()], [rng.random(40).tolist()])
+    assert same.low < 0.5 < same.high
+
+
+def test_wilson_interval_is_the_published_one():
+    # Newcombe (1998), Table I, score method without continuity correction: 15/148 and 0/20.
+    assert wilson(15, 148) == pytest.approx((6.24, 16.05), abs=0.1)
+    assert wilson(0, 20) == pytest.approx((0.0, 16.11), abs=0.01)
