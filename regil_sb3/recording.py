@@ -18,7 +18,14 @@ from regil_wrappers.demonstration import Demonstration
 
 from regil_sb3.envs import EVALUATION_SEEDS
 
-__all__ = ["EVALUATION_SEEDS", "NoExpertError", "Recorder", "check_seeds", "record_expert"]
+__all__ = [
+    "EVALUATION_SEEDS",
+    "NoExpertError",
+    "Recorder",
+    "check_seeds",
+    "make_env",
+    "record_expert",
+]
 
 _PACKAGES = ("gymnasium", "metaworld", "mujoco", "numpy", "regil-sb3", "regil-wrappers")
 
@@ -59,7 +66,7 @@ def record_expert(
         ValueError: where a seed belongs to evaluation, or no seed leads to success.
     """
     check_seeds(seed, max_seeds)
-    env = made(env_id, env_kwargs)
+    env = make_env(env_id, env_kwargs)
     try:
         if not hasattr(env.unwrapped, "expert_action"):
             raise NoExpertError(
@@ -85,7 +92,7 @@ def record_expert(
         env.close()
 
 
-def made(env_id: str, env_kwargs: dict[str, Any] | None) -> gym.Env[Any, Any]:
+def make_env(env_id: str, env_kwargs: dict[str, Any] | None) -> gym.Env[Any, Any]:
     """The environment.
 
     Raises:

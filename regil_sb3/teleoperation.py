@@ -16,7 +16,7 @@ import numpy.typing as npt
 from regil_wrappers import Demonstration
 
 from regil_sb3.devices import Axes, Command, Device, make_device
-from regil_sb3.recording import Recorder, check_seeds, made
+from regil_sb3.recording import Recorder, check_seeds, make_env
 from regil_sb3.teleop_window import Window
 
 __all__ = ["Clock", "Session", "teleoperate"]
@@ -129,7 +129,7 @@ def teleoperate(
         ImportError: of one line, if a package is not installed.
     """
     check_seeds(seed)
-    with closing(made(env_id, env_kwargs)) as env:
+    with closing(make_env(env_id, env_kwargs)) as env:
         recorder = Recorder(env, encoder_frame_size)
         name = device if isinstance(device, str) else type(device).__name__.lower()
         with closing(Window(f"regil record {env_id}")) as window:

@@ -36,7 +36,9 @@ class Drawn(Reach):
 def environments():
     gym.register(TOY, entry_point=Drawn)
     gym.register(STATES, entry_point=Drawn, kwargs={"dict_obs": True})
-    yield
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SDL_VIDEODRIVER", "none")  # recording by hand would open a window
+        yield
     del gym.registry[TOY], gym.registry[STATES]
 
 
@@ -108,6 +110,7 @@ COMMANDS = [
     (["record", "nobody/knows-v0", "-o", "x.hdf5"], "nobody"),
     (["record", "not an id", "-o", "x.hdf5"], "not an id"),
     (["record", TOY, "-o", "x.hdf5"], "no scripted expert"),
+    (["record", TOY, "-o", "x.hdf5", "--teleop", "keyboard"], "no window can be opened"),
     (["record", TOY, "-o", "good.hdf5"], "exists already"),
     (["record", TOY, "-o", "x.hdf5", "--env-kwargs", "size"], "KEY=VALUE"),
     (["record", TOY, "-o", "x.hdf5", "--env-kwargs", "sice=3"], "sice"),
