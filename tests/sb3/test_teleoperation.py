@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -287,13 +291,17 @@ def test_no_spacemouse_is_one_line(capsys, tmp_path):
     assert "SpaceMouse" in capsys.readouterr().err
 
 
-def test_without_a_screen_it_says_so(monkeypatch, capsys, tmp_path):
-    for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    pg.display.quit()
-    words = ["record", ENV, "--teleop", "keyboard", "-o", str(tmp_path / "demo.hdf5")]
-    assert main(words) == 2
-    assert "no window can be opened here" in capsys.readouterr().err
+def test_without_a_screen_it_says_so(tmp_path):
+    """In a process of its own: SDL's last resort ends the EGL display that MuJoCo draws with."""
+    hidden = ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY")
+    env = {name: value for name, value in os.environ.items() if name not in hidden}
+    words = ["record", "regil/metaworld-reach-v0", "--teleop", "keyboard", "-o", "demo.hdf5"]
+    done = subprocess.run(
+        [sys.executable, "-m", "regil_sb3.cli", *words],
+        env=env, cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "regil: no window can be opened here" in done.stderr
 
 
 def test_which_dimensions_move():
