@@ -32,7 +32,6 @@ docs: $(STAMP)
 # Wheels and sdists of both, the same to the bit from the same commit
 dist: $(STAMP)
 	$(BIN)/python .ci/dist.py dist
-	$(BIN)/python -m twine check --strict dist/*
 
 # The tests with the oldest versions that setup.cfg allows, in .venv-oldest
 test-oldest:

@@ -1,9 +1,10 @@
-"""Build wheel and sdist of both distributions, the same to the bit from the same commit.
+"""Build and check wheels and sdists of both distributions.
 
     python .ci/dist.py [FOLDER]     (dist)
 
-All files get one time: SOURCE_DATE_EPOCH, else that of the last commit. With that setuptools makes
-reproducible wheels, but no such sdists: these are packed again, and wheels are built from them.
+From the same commit they are the same to the bit. All files get one time: SOURCE_DATE_EPOCH, else
+that of the last commit. With that setuptools makes reproducible wheels, but no such sdists: these
+are packed again, and wheels are built from them.
 """
 
 from __future__ import annotations
@@ -63,8 +64,7 @@ def main(out: Path) -> None:
             builder = ProjectBuilder.from_isolated_env(env, project)
             env.install(builder.build_system_requires)
             env.install(builder.get_requires_for_build("sdist"))
-            made = Path(builder.build("sdist", work / "sdists"))
-            sdist = packed_again(made, out, epoch)
+            sdist = packed_again(Path(builder.build("sdist", work / "sdists")), out, epoch)
             with tarfile.open(sdist) as archive:
                 archive.extractall(work / "unpacked", filter="data")
             unpacked = work / "unpacked" / sdist.name.removesuffix(".tar.gz")
@@ -72,6 +72,9 @@ def main(out: Path) -> None:
             env.install(builder.get_requires_for_build("wheel"))
             wheel = Path(builder.build("wheel", out))
             print(sdist, wheel, sep="\n")
+        env.install(["twine>=6"])
+        twine = [env.python_executable, "-m", "twine", "check", "--strict"]
+        subprocess.run([*twine, *sorted(out.iterdir())], check=True)
 
 
 if __name__ == "__main__":

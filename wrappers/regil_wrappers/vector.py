@@ -11,7 +11,7 @@ alignments. All of `gymnasium.vector.AutoresetMode` are followed, and ``options[
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Generic, Literal
 
 import numpy as np
 from gymnasium.core import ActType, ObsType
@@ -35,7 +35,17 @@ Infos = dict[str, Any]
 Seeds = int | list[int | None] | None
 
 
-class _RetrievalWrapper(VectorWrapper[ObsType, ActType, ObsType, ActType, Array]):
+if TYPE_CHECKING:
+
+    class _Wrapper(VectorWrapper[ObsType, ActType, ObsType, ActType, Array]): ...
+
+else:  # before Gymnasium 1.4 it takes no types
+
+    class _Wrapper(VectorWrapper, Generic[ObsType, ActType]):
+        """Gymnasium's own."""
+
+
+class _RetrievalWrapper(_Wrapper[ObsType, ActType]):
     """What both share. The innermost one takes the pictures, those outside read alignments."""
 
     def __init__(
