@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from regil_wrappers.pinhole import Pinhole, fit_pinhole, nearest_to_path, solve_displacement
+from scipy.spatial.transform import Rotation
 
 PLANE = np.array([10.0, 10.0, 0.5])
 
@@ -215,3 +216,16 @@ def test_a_damaged_camera_is_refused(change: dict[str, Any]) -> None:
     del values["mirror"]
     with pytest.raises(ValueError, match="mirror"):
         Pinhole.from_dict({**looking_down().as_dict(), "mirror": None})
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+@pytest.mark.parametrize("turn", range(0, 360, 45))
+def test_a_camera_that_stands_anywhere_about_is_found(turn: int, mirror: int) -> None:
+    rotation = Rotation.from_euler("xz", [-115, turn], degrees=True).inv().as_rotvec()
+    camera = Pinhole(tuple(rotation), 85.4, 58.0, (40.9, 32.6), (84, 84), mirror, 0.0)
+    moves = [(5.5 * np.eye(3)[axis] * side) for axis in range(3) for side in (1, -1)]
+    before, after = np.zeros((6, 3)), np.stack(moves)
+    shifts = camera.project(after) - camera.project(before)
+    fit = fit_pinhole(before, after, shifts, np.array([41.0, 33.0]), (84, 84), mirror, 11.0)
+    assert fit.cost < 2
+    assert np.abs(fit.project(after) - camera.project(after)).max() < 1

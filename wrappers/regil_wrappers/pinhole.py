@@ -10,6 +10,7 @@ An action unit is the way the hand goes in one step under an action of 1.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, cast
 
@@ -22,6 +23,7 @@ __all__ = ["Pinhole", "fit_pinhole", "nearest_to_path", "solve_displacement"]
 Floats = NDArray[np.float64]
 
 _STARTS = 8
+_AROUND = range(0, 360, 60)  # degrees
 _FOCAL_STD = 0.1  # of the logarithm
 _DEPTH_STD = 0.7  # of the logarithm
 _HAND_STD = 2.5  # px at 84 pixels
@@ -177,10 +179,16 @@ def fit_pinhole(
         priors += list((x[5:] - hand) / (_HAND_STD * unit))
         return np.concatenate([np.sqrt(2 * np.log1p(r * r / 2)).ravel(), priors])
 
-    starts = Rotation.random(_STARTS, random_state=seed).as_rotvec()
-    fits = [
-        least_squares(residuals, [*start, focal, depth, *hand], max_nfev=60) for start in starts
-    ]
+    def fitted(starts: Iterable[Floats]) -> list[Any]:
+        return [
+            least_squares(residuals, [*start, focal, depth, *hand], max_nfev=60) for start in starts
+        ]
+
+    fits = fitted(Rotation.random(_STARTS, random_state=seed).as_rotvec())
+    if min(fit.cost for fit in fits) > shifts.size:
+        # Chance has missed it: most cameras stand about, upright, and look a little down
+        around = [Rotation.from_euler("xz", [-110, turn], degrees=True) for turn in _AROUND]
+        fits += fitted(rotation.inv().as_rotvec() for rotation in around)
     best = min(fits, key=lambda fit: fit.cost)
     found = camera(best.x, float(best.cost))
     # Plain numbers, so that the camera can be written as JSON
