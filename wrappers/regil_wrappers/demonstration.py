@@ -33,6 +33,7 @@ written by `regil_wrappers.formats`.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Iterator
@@ -179,9 +180,11 @@ class Demonstration:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        memory = io.BytesIO()  # HDF5 may crash the process when it writes to a full disk
+        with h5py.File(memory, "w") as file:
+            self._write(file)
         try:
-            with h5py.File(temporary, "w") as file:
-                self._write(file)
+            temporary.write_bytes(memory.getbuffer())
             _sync(temporary)
             os.replace(temporary, path)
         finally:
