@@ -40,17 +40,18 @@ class SuccessBuffer:
         self.n_stack = n_stack
         self._episodes: deque[_Episode] = deque()
         self._pinned: list[_Episode] = []
-        self._ends = np.zeros(0, np.int64)
+        self._settle()
 
     @property
     def steps(self) -> int:
         """Steps held, the demonstration's included."""
-        return int(self._ends[-1]) if len(self._ends) else 0
+        episodes, ends = self._content
+        return int(ends[-1]) if episodes else 0
 
     @property
     def episodes(self) -> int:
         """Episodes held, the demonstration included."""
-        return len(self._ends)
+        return len(self._content[0])
 
     def _newest(self, observations: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return observations[:, -(observations.shape[1] // self.n_stack) :]
@@ -91,8 +92,13 @@ class SuccessBuffer:
             self._episodes.append(episode)
         while self._episodes and sum(map(len, (*self._pinned, *self._episodes))) > self.capacity:
             self._episodes.popleft()
-        self._ends = np.cumsum([len(e) for e in (*self._pinned, *self._episodes)])
+        self._settle()
         return True
+
+    def _settle(self) -> None:
+        """Make the episodes what is sampled from: at once, as another thread may be sampling."""
+        episodes = (*self._pinned, *self._episodes)
+        self._content = episodes, np.cumsum([len(e) for e in episodes])
 
     def _observation(self, episode: _Episode, step: int) -> npt.NDArray[Any]:
         frames = episode.observations
@@ -114,13 +120,13 @@ class SuccessBuffer:
         Raises:
             ValueError: the buffer is empty.
         """
-        if not self.steps:
+        episodes, ends = self._content
+        if not episodes:
             raise ValueError("the success buffer is empty: TD3BC needs demo= for its BC term")
-        episodes = (*self._pinned, *self._episodes)
-        drawn = np.random.randint(0, self.steps, size=batch_size)
-        which = np.searchsorted(self._ends, drawn, side="right")
+        drawn = np.random.randint(0, ends[-1], size=batch_size)
+        which = np.searchsorted(ends, drawn, side="right")
         picks = [
-            (episodes[e], int(i - self._ends[e] + len(episodes[e])))
+            (episodes[e], int(i - ends[e] + len(episodes[e])))
             for i, e in zip(drawn, which, strict=True)
         ]
         actions = np.stack([episode.actions[step] for episode, step in picks])
@@ -164,7 +170,7 @@ class SuccessBuffer:
                 }
             )
             self._episodes.append(_Episode(observations, state[f"{i}/actions"]))
-        self._ends = np.cumsum([len(e) for e in (*self._pinned, *self._episodes)])
+        self._settle()
 
 
 def _film(observations: Observations) -> npt.NDArray[np.uint8] | None:

@@ -1,0 +1,93 @@
+"""TD3BC with its updates beside the control loop."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import toy_env
+from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+
+from regil_sb3 import TD3BC
+from regil_sb3.background import BackgroundTD3BC
+
+
+def made(demo, pauses=None, **arguments):
+    def make():
+        env = toy_env.ToyReach()
+        if pauses is not None:
+            env.pause = lambda: pauses.append("pause")
+            env.resume = lambda: pauses.append("resume")
+        return RetrievalRewardWrapper(RetrievalGuideWrapper(env, demo=demo), demo=demo)
+
+    settings = {
+        "warmup_steps": 60,
+        "learning_starts": 20,
+        "bc_pretrain_steps": 10,
+        "buffer_size": 1000,
+        "batch_size": 8,
+        "seed": 0,
+    }
+    envs = VecFrameStack(DummyVecEnv([make]), 2)
+    return BackgroundTD3BC("CnnPolicy", envs, demo=demo, **(settings | arguments))
+
+
+def test_it_does_all_updates_and_keeps_all_transitions(demo):
+    pauses = []
+    model = made(demo, pauses).learn(200)
+    assert model.num_timesteps == model.replay_buffer.total == 200
+    assert model._n_updates == (200 - 20) // 2
+    assert model.pretrained
+    assert model.success_buffer.episodes > 1
+    assert pauses == ["pause", "resume"] * 2  # the updates at the end of the warm-up; the last ones
+
+
+def test_what_acts_is_what_has_learned(demo):
+    model = made(demo)
+    seen = model.env.reset()
+    before = model.predict(seen, deterministic=True)[0]
+    model.learn(150)
+    after = model.predict(seen, deterministic=True)[0]
+    assert not np.allclose(before, after)
+    assert model._acting is None
+
+
+def test_it_is_saved_and_loaded_as_td3bc(demo, tmp_path):
+    model = made(demo).learn(100)
+    model.save(tmp_path / "model.zip")
+    loaded = TD3BC.load(tmp_path / "model.zip", buffer_size=1)
+    seen = model.env.reset()
+    assert np.array_equal(loaded.predict(seen)[0], model.predict(seen)[0])
+
+
+def test_collecting_does_not_wait_for_updates(demo, monkeypatch):
+    collected = threading.Event()
+    pays = TD3BC.train
+
+    def train(self, *arguments):
+        assert collected.wait(60)  # if collecting waited for this, it would wait for ever
+        pays(self, *arguments)
+
+    monkeypatch.setattr(TD3BC, "train", train)
+    model = made(demo, warmup_steps=1000, learning_starts=0)
+
+    def step(*_):
+        if model.num_timesteps == 60:
+            assert model._n_updates == 0
+            collected.set()
+        return True
+
+    model.learn(60, callback=step)
+    assert model._n_updates == 30
+
+
+def test_a_failure_of_the_learner_ends_learning(demo, monkeypatch):
+    def broken(self, *_):
+        raise FloatingPointError("critic loss is nan")
+
+    monkeypatch.setattr(BackgroundTD3BC, "_empty_inbox", lambda self: None)
+    monkeypatch.setattr(TD3BC, "_require_finite", broken)
+    with pytest.raises(FloatingPointError, match="critic loss is nan"):
+        made(demo).learn(5_000)
