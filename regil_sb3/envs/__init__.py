@@ -6,7 +6,13 @@ imports a simulator, torch or stable-baselines3.
 
 from regil_sb3.envs.libero_tasks import LIBERO_TASKS
 
-__all__ = ["EVALUATION_SEEDS", "LIBERO_TASKS", "METAWORLD_TASKS", "register_envs"]
+__all__ = [
+    "EVALUATION_SEEDS",
+    "LIBERO_TASKS",
+    "METAWORLD_TASKS",
+    "REHEARSAL_TASKS",
+    "register_envs",
+]
 
 EVALUATION_SEEDS = 1_000_000
 """Seeds from here on belong to evaluation: a demonstration must not know what it is tested on."""
@@ -65,9 +71,12 @@ METAWORLD_TASKS = (
 )
 """Meta-World's v3 tasks by their own names, without `-v3`."""
 
+REHEARSAL_TASKS = ("reach", "insert", "open")
+"""The paper's tasks on a real robot."""
+
 
 def register_envs() -> None:
-    """Register `regil/metaworld-<task>-v0` and `regil/libero-<task>-v0` for every task.
+    """Register `regil/metaworld-<task>-v0`, `regil/libero-...` and `regil/rehearsal-...`.
 
     The time limit is not Gymnasium's: it sits inside the environment (`max_steps`), where it
     counts agent steps under the action repeat and truncates.
@@ -77,6 +86,7 @@ def register_envs() -> None:
     simulators = {
         "metaworld": ("regil_sb3.envs.metaworld:MetaWorldEnv", METAWORLD_TASKS),
         "libero": ("regil_sb3.envs.libero:LiberoEnv", LIBERO_TASKS),
+        "rehearsal": ("regil_sb3.envs.rehearsal:RehearsalEnv", REHEARSAL_TASKS),
     }
     for simulator, (entry_point, tasks) in simulators.items():
         for task in tasks:
