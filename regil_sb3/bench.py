@@ -6,6 +6,7 @@ what counts is the ratio of their medians.
 
 from __future__ import annotations
 
+import inspect
 import os
 import time
 from collections.abc import Callable
@@ -201,7 +202,8 @@ def main(table: str, **options: Any) -> list[Row]:
     Args:
         table: one of `TABLES`, "ranking" (`regil_sb3.bench_rewards`), "guide" or "success-buffer"
             (`regil_sb3.bench_guide`), "latency" (`regil_sb3.bench_latency`), "memory" or "index"
-            (`regil_sb3.bench_memory`), "throughput" (`regil_sb3.bench_throughput`).
+            (`regil_sb3.bench_memory`), "throughput" (`regil_sb3.bench_throughput`), or one of
+            `regil_sb3.bench_runs.LEARNING`.
         **options: the table's own.
 
     Returns:
@@ -214,6 +216,16 @@ def main(table: str, **options: Any) -> list[Row]:
         from regil_sb3 import bench_guide
 
         bench_guide.main(table, **options)
+        return []
+    from regil_sb3 import bench_runs
+
+    if table in bench_runs.LEARNING:
+        known = set(inspect.signature(bench_runs.planned).parameters)
+        known |= set(inspect.signature(bench_runs.main).parameters)
+        for name in options:
+            if name not in known - {"name", "root", "options"}:
+                raise ValueError(f"the table {table!r} has no option --{name}")
+        bench_runs.main(table, **options)
         return []
     for name in options:
         if name not in _OPTIONS.get(table, ()):

@@ -136,8 +136,8 @@ def _parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="measure, as ratios in one run")
     bench.add_argument(
         "table",
-        help="rendering, retrieval, ranking, guide, success-buffer, latency, memory, index or "
-        "throughput",
+        help="rendering, retrieval, ranking, guide, success-buffer, latency, memory, index, "
+        "throughput; ablations, rewards (training runs)",
     )
     bench.add_argument(
         "--tasks",
@@ -145,16 +145,26 @@ def _parser() -> argparse.ArgumentParser:
         metavar="TASK",
         help="guide, success-buffer: Meta-World's (the paper's 7)",
     )
-    bench.add_argument("--seeds", nargs="+", type=int, help="the same: of demonstrations (0 1; 0)")
-    bench.add_argument("--episodes", type=int, help="guide: goals of each (20)")
+    bench.add_argument("--seeds", nargs="+", type=int, help="of demonstrations and runs (0 1; 0)")
+    bench.add_argument("--episodes", type=int, help="goals of each (20; 40)")
     bench.add_argument("--disturbances", nargs="+", metavar="NAME", help="guide: (none)")
-    bench.add_argument("--steps", type=int, help="success-buffer: agent steps (5000)")
+    bench.add_argument("--steps", type=int, help="agent steps (5000; 15000)")
     bench.add_argument("--encoders", nargs="+", metavar="NAME", help="latency: (those at hand)")
     bench.add_argument(
         "--frames", nargs="+", type=int, help="latency, memory, index: sizes of memory"
     )
     bench.add_argument("--dims", type=int, help="memory, index: of the embeddings (384)")
     bench.add_argument("--plot", metavar="FILE", help="memory: draw it")
+    bench.add_argument("--methods", nargs="+", metavar="NAME", help="training runs: of these alone")
+    bench.add_argument("--out", help="training runs: where they are kept (bench)")
+    bench.add_argument(
+        "--dry-run",
+        action="store_true",
+        default=None,
+        help="training runs: say which, and for how long",
+    )
+    bench.add_argument("--workers", type=int, help="training runs: so many at a time (1)")
+    bench.add_argument("--ray", metavar="ADDRESS", help="training runs: on a Ray cluster, or local")
     return parser
 
 

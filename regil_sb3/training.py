@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ from regil_sb3.settings import Settings
 from regil_sb3.success_films import save_films
 from regil_sb3.td3bc import TD3BC
 
+METHODS = ("policy", "best_policy", "guide", "corrected_guide", "bc")  # that are evaluated
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
 
 
@@ -277,7 +278,20 @@ def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int)
     return model
 
 
-def evaluate_run(run: Path, episodes: int, trust: bool = False) -> dict[str, Any]:
+def _bc_model(
+    settings: Settings, demo: Demonstration, env: VecEnv, run: Path, trust: bool
+) -> TD3BC:
+    """A run's "BC", from its folder or trained now."""
+    if (run / "bc_model.zip").exists():
+        return TD3BC.load(run / "bc_model.zip", trust=trust, buffer_size=1)
+    bc = train_bc(settings, demo, env, BC_UPDATES)
+    save_model(bc, run / "bc_model.zip")
+    return bc
+
+
+def evaluate_run(
+    run: Path, episodes: int, trust: bool = False, only: Sequence[str] = METHODS
+) -> dict[str, Any]:
     """Evaluate a run's last and best model, both guides and BC, and write ``evaluation.json``.
 
     BC is trained here when the folder has no ``bc_model.zip`` yet.
@@ -286,6 +300,7 @@ def evaluate_run(run: Path, episodes: int, trust: bool = False) -> dict[str, Any
         run: the folder.
         episodes: unseen episodes, the same for each method.
         trust: whether the models may name anything, and so run code (``TD3BC.load``).
+        only: which of `METHODS`; BC, which has to be trained, is not where it is not asked for.
 
     Returns:
         What was written.
@@ -302,11 +317,6 @@ def evaluate_run(run: Path, episodes: int, trust: bool = False) -> dict[str, Any
         closing(make_env(settings.plain(), run / "demo.hdf5", n_envs=1)) as plain_env,
     ):
         model = TD3BC.load(run / "model.zip", trust=trust, buffer_size=1)
-        if (run / "bc_model.zip").exists():
-            bc = TD3BC.load(run / "bc_model.zip", trust=trust, buffer_size=1)
-        else:
-            bc = train_bc(settings, demo, env, BC_UPDATES)
-            save_model(bc, run / "bc_model.zip")
         results: dict[str, Any] = {
             "steps": model.num_timesteps,
             "frames": model.num_timesteps * action_repeat(env),
@@ -319,7 +329,9 @@ def evaluate_run(run: Path, episodes: int, trust: bool = False) -> dict[str, Any
             acts.append(("guide", guide_act, plain_env))
         if load_calibration(env, run / "calibration.json"):
             acts.append(("corrected_guide", guide_act, env))
-        acts.append(("bc", policy_act(bc), env))
+        if "bc" in only:
+            acts.append(("bc", policy_act(_bc_model(settings, demo, env, run, trust)), env))
+        acts = [act for act in acts if act[0] in only]
         for name, act, where in acts:
             with tqdm(total=episodes, desc=f"evaluating {name}", dynamic_ncols=True) as bar:
 

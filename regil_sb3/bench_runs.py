@@ -1,0 +1,252 @@
+"""`regil bench ablations` and its like: methods that learn, on the same tasks and unseen seeds.
+
+Each run is kept and never made twice; a bench that was stopped goes on (`regil_sb3.runs`). What is
+printed is made from the run folders alone: success of the last policy with intervals, the paper's
+figures beside it, and the steps to .8 and .95.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from regil_sb3.intervals import Interval, iqm
+from regil_sb3.machine import describe
+from regil_sb3.runs import Run, finish_all, predicted_hours, seconds_of
+
+__all__ = ["LEARNING", "main", "planned", "raw", "table"]
+
+LEVELS = (0.8, 0.95)
+
+
+def _tables() -> dict[str, Any]:
+    text = (resources.files("regil_sb3.zoo_configs") / "tables.yml").read_text(encoding="utf-8")
+    tables: dict[str, Any] = yaml.safe_load(text)
+    return tables
+
+
+LEARNING = tuple(name for name in _tables() if name != "paper")
+"""Tables whose rows are training runs."""
+
+
+def planned(
+    name: str,
+    root: Path | str,
+    tasks: Sequence[str] | None = None,
+    seeds: Sequence[int] | None = None,
+    steps: int | None = None,
+    episodes: int | None = None,
+    methods: Sequence[str] | None = None,
+) -> list[Run]:
+    """The runs of a table.
+
+    Args:
+        name: of the table.
+        root: folder of all runs; tables share them.
+        tasks: Meta-World's names, in place of the table's own.
+        seeds: likewise; each has a demonstration of its own.
+        steps: agent steps, likewise.
+        episodes: unseen episodes at the end, likewise.
+        methods: the table's that are wanted.
+
+    Raises:
+        ValueError: there is no such method.
+    """
+    said = _tables()[name]
+    for method in methods or ():
+        if method not in said["methods"]:
+            raise ValueError(f"--methods {method}: choose from {', '.join(said['methods'])}")
+    return [
+        Run(
+            root=str(root),
+            env=f"regil/metaworld-{task}-v0",
+            method=method,
+            seed=seed,
+            steps=steps or said["steps"],
+            episodes=episodes or said["episodes"],
+            preset=asked.get("preset", ""),
+            settings=tuple(asked.get("settings", ())),
+            demo=str(Path(root) / "demos" / f"{task}-{seed}.hdf5"),
+        )
+        for task in tasks or said["tasks"]
+        for seed in seeds or said["seeds"]
+        for method, asked in said["methods"].items()
+        if not methods or method in methods
+    ]
+
+
+def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
+    """What finished runs found: a row for each run and unseen episode."""
+    for run in runs:
+        if not run.finished:
+            continue
+        policy = json.loads((run.folder / "evaluation.json").read_text())["policy"]
+        for episode, success in enumerate(policy["successes"]):
+            yield {
+                "task": _task(run),
+                "method": run.method,
+                "seed": run.seed,
+                "steps": run.steps,
+                "episode": episode,
+                "success": bool(success),
+                "length": int(policy["lengths"][episode]),
+                "minutes": (seconds_of(run) or np.nan) / 60,
+                **{f"steps to {level}": _steps_to(run, level) for level in LEVELS},
+            }
+
+
+def _task(run: Run) -> str:
+    return run.env.removeprefix("regil/metaworld-").removesuffix("-v0")
+
+
+def _steps_to(run: Run, level: float) -> float:
+    """Agent steps at the first evaluation during training that reached it; NaN: none did."""
+    with (run.folder / "progress.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            if row["eval/success_rate"] and float(row["eval/success_rate"]) >= level:
+                return float(row["time/total_timesteps"])
+    return float("nan")
+
+
+def table(runs: Sequence[Run]) -> list[str]:
+    """The table in Markdown: a line a method, a column a task, and the mean over tasks.
+
+    A cell is the mean over seeds; in brackets the paper's own, after ten times the steps. The
+    interquartile mean over tasks and seeds has a 95 % interval by the stratified bootstrap.
+    """
+    rows = list(raw(runs))
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    paper = _tables()["paper"]
+    lines = [
+        f"| method | {' | '.join(tasks)} | IQM (95 %) | runs | steps to .8 | steps to .95 | "
+        "minutes |",
+        "|" + "---|" * (len(tasks) + 6),
+    ]
+    for method in methods:
+        own = [row for row in rows if row["method"] == method]
+        cells = []
+        for task in tasks:
+            here = [row["success"] for row in own if row["task"] == task]
+            cell = f"{np.mean(here):.3f}" if here else "-"
+            told = paper.get(task, {}).get(method)
+            cells.append(cell if told is None else f"{cell} ({told:g})")
+        by_run: dict[tuple[str, int], dict[str, Any]] = {
+            (row["task"], row["seed"]): row for row in own
+        }
+        scores = [
+            [
+                float(np.mean([row["success"] for row in own if (row["task"], row["seed"]) == run]))
+                for run in by_run
+                if run[0] == task
+            ]
+            for task in tasks
+            if any(run[0] == task for run in by_run)
+        ]
+        found = iqm(scores)
+        reached = [_median(by_run.values(), f"steps to {level}") for level in LEVELS]
+        minutes = np.mean([row["minutes"] for row in by_run.values()])
+        cells += [_interval(found), str(len(by_run)), *reached, f"{minutes:.1f}"]
+        lines.append(f"| {method} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def _median(rows: Iterable[dict[str, Any]], column: str) -> str:
+    """The median over runs, where those that never got there come last; "-": it is one of those."""
+    value = float(np.median([np.nan_to_num(row[column], nan=np.inf) for row in rows]))
+    return f"{value:,.0f}" if np.isfinite(value) else "-"
+
+
+def _interval(found: Interval) -> str:
+    if np.isnan(found.low):
+        return f"{found.value:.3f}"
+    return f"{found.value:.3f} ({found.low:.3f} to {found.high:.3f})"
+
+
+def main(
+    name: str,
+    out: str = "bench",
+    dry_run: bool = False,
+    workers: int = 1,
+    ray: str = "",
+    **options: Any,
+) -> None:
+    """Make what is missing of a table, and print it.
+
+    Args:
+        name: of the table.
+        out: folder of the runs, and of ``NAME.md``, ``NAME.tex`` and ``NAME.parquet``.
+        dry_run: print the runs and the predicted hours, and make none.
+        workers: runs at a time.
+        ray: address of a Ray cluster to run on; "local" starts one.
+        **options: of `planned`.
+
+    Raises:
+        ValueError: an option does not fit; or runs failed, which are named.
+        ImportError: pyarrow or Ray is not installed.
+    """
+    if workers < 1:
+        raise ValueError(f"--workers {workers}: at least 1 is needed")
+    runs = planned(name, out, **options)
+    missing = [run for run in runs if not run.finished]
+    if dry_run:
+        for run in runs:
+            print(f"{run.folder}: {'finished' if run.finished else run.command}")
+        print(
+            f"{len(missing)} of {len(runs)} runs to make: about "
+            f"{predicted_hours(runs, workers):.1f} hours, {workers} at a time"
+        )
+        return
+    import pyarrow as pa  # type: ignore[import-untyped]
+    from pyarrow import parquet
+
+    failed = finish_all(runs, workers, ray)
+    rows = list(raw(runs))
+    if rows:
+        lines = table(runs)
+        below = describe(("gymnasium", "metaworld", "mujoco", "stable-baselines3", "torch"))
+        folder = Path(out)
+        command = f"    regil bench {name}{_words(options)}"
+        text = "\n".join([command, "", *lines, "", below, ""])
+        (folder / f"{name}.md").write_text(text, encoding="utf-8")
+        (folder / f"{name}.tex").write_text(_latex(lines), encoding="utf-8")
+        parquet.write_table(pa.Table.from_pylist(rows), folder / f"{name}.parquet")
+        print("\n".join(lines))
+    if failed:
+        raise ValueError(f"{len(failed)} runs failed: {'; '.join(failed)}")
+
+
+def _words(options: dict[str, Any]) -> str:
+    words = ""
+    for option, value in options.items():
+        values = value if isinstance(value, list | tuple) else [value]
+        words += f" --{option} {' '.join(map(str, values))}"
+    return words
+
+
+def _latex(lines: list[str]) -> str:
+    """The same table in LaTeX (booktabs)."""
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    head, body = cells[0], cells[2:]
+    rows = [
+        " & ".join(row).replace("%", r"\%").replace("_", r"\_") + r" \\" for row in [head, *body]
+    ]
+    return "\n".join(
+        [
+            r"\begin{tabular}{l" + "c" * (len(head) - 1) + "}",
+            r"\toprule",
+            rows[0],
+            r"\midrule",
+            *rows[1:],
+            r"\bottomrule",
+            r"\end{tabular}",
+            "",
+        ]
+    )

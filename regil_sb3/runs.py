@@ -1,0 +1,248 @@
+"""Many training runs: each is done once, on this machine or on many, and a killed one goes on.
+
+* ``Run`` - one method on one task with one seed: what `regil train` is to be given, and its folder
+* ``finish`` - trains a run to its end, or goes on with it, and evaluates it
+* ``finish_all`` - several at a time, as processes here or as tasks of a Ray cluster
+* ``predicted_hours`` - from what finished runs took
+
+A run is a folder; it is finished when it holds ``evaluation.json``. Nothing else is kept about it,
+so that any number of machines that see the folders may take part, one after the other.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from tqdm import tqdm
+
+__all__ = ["Run", "finish", "finish_all", "predicted_hours", "seconds_of"]
+
+_SECONDS_A_STEP = 15 * 60 / 15_000  # of one core, until a run has told
+_AGAIN = 3  # times that a run that died is taken up again
+_GRACE = 60.0  # s that an interrupted run is given to save itself
+_SHOWN_EVERY = 5.0  # s
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run.
+
+    Attributes:
+        root: the folder of all runs.
+        env: id of the environment.
+        method: its name in tables.
+        seed: of demonstration, networks and sampling.
+        steps: agent steps.
+        demo: the demonstration's file; recorded where it is not there.
+        episodes: unseen episodes at the end.
+        preset: section of the zoo's YAML; "" takes the environment's own.
+        settings: "KEY=VALUE" on top of it.
+    """
+
+    root: str
+    env: str
+    method: str
+    seed: int
+    steps: int
+    demo: str
+    episodes: int = 40
+    preset: str = ""
+    settings: tuple[str, ...] = ()
+
+    @property
+    def folder(self) -> Path:
+        """Where it is: task, method, seed and steps tell it from all others."""
+        task = self.env.rpartition("/")[2].removesuffix("-v0")
+        return Path(self.root) / f"{task}-{self.method}-{self.seed}-{self.steps}"
+
+    @property
+    def finished(self) -> bool:
+        """Whether it is trained and evaluated."""
+        return (self.folder / "evaluation.json").exists()
+
+    @property
+    def command(self) -> str:
+        """What makes the same run by hand, its evaluation aside."""
+        words = ["regil train --env", self.env, "--seed", str(self.seed)]
+        words += ["--demo", self.demo, "--steps", str(self.steps), "--episodes", str(self.episodes)]
+        words += ["--preset", self.preset] if self.preset else []
+        words += [f"--set {setting}" for setting in self.settings]
+        return " ".join([*words, "--out", str(self.folder)])
+
+
+def seconds_of(run: Run) -> float | None:
+    """What a finished run took, in s; None where that is not known."""
+    try:
+        return float(json.loads((run.folder / "took.json").read_text())["seconds"])
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def predicted_hours(runs: Sequence[Run], workers: int) -> float:
+    """Hours that the unfinished runs will take, by what finished ones took a step."""
+    known = [(seconds_of(run), run.steps) for run in runs if run.finished]
+    told = [(seconds, steps) for seconds, steps in known if seconds is not None]
+    rate = sum(s for s, _ in told) / sum(n for _, n in told) if told else _SECONDS_A_STEP
+    return rate * sum(run.steps for run in runs if not run.finished) / max(workers, 1) / 3600
+
+
+def finish(run: Run) -> None:
+    """Train, or go on, and evaluate.
+
+    Raises:
+        RuntimeError: it could not be done; ``log.txt`` in the run's folder says why.
+    """
+    if run.finished:
+        return
+    run.folder.mkdir(parents=True, exist_ok=True)
+    begun, took = time.time(), seconds_of(run) or 0.0
+    process = get_context("spawn").Process(target=_train, args=(run,))
+    process.start()
+    try:
+        process.join()
+    except BaseException:
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGINT)  # it saves itself
+        process.join(_GRACE)
+        raise
+    finally:
+        seconds = took + time.time() - begun
+        (run.folder / "took.json").write_text(json.dumps({"seconds": seconds}))
+    if process.exitcode or not run.finished:
+        raise RuntimeError(f"{run.folder} ended with status {process.exitcode}: see log.txt there")
+
+
+def _train(run: Run) -> None:
+    """In a process of its own, whose output is the run's ``log.txt``."""
+    if sys.platform == "linux":  # a run saves itself and ends where whoever waits for it is gone
+        import ctypes
+
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+    log = os.open(run.folder / "log.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
+
+    from regil_wrappers import Demonstration
+
+    from regil_sb3 import process, training
+    from regil_sb3.settings import make_settings
+
+    process.keep_freed_memory()
+    process.set_threads()
+    if (run.folder / "config.yaml").exists():
+        training.resume(run.folder)
+    else:
+        settings = make_settings(
+            run.env, run.preset or None, run.seed, run.steps, list(run.settings)
+        )
+        training.train(settings, Demonstration.load(run.demo), run.folder)
+    training.evaluate_run(run.folder, run.episodes, only=("policy", "best_policy"))
+
+
+def finish_all(
+    runs: Sequence[Run], workers: int = 1, ray: str = "", cpus: float = 1, gpus: float = 0
+) -> list[str]:
+    """Finish every run that is not; several at a time.
+
+    Args:
+        runs: all of them; finished ones cost nothing.
+        workers: processes at a time, without Ray.
+        ray: address of a Ray cluster, or "auto"; "local" starts one here. Its nodes must see the
+            runs' folder under the same path. "": none.
+        cpus: that Ray gives to a run.
+        gpus: likewise.
+
+    Returns:
+        one line for each run that could not be finished.
+
+    Raises:
+        ImportError: Ray is not installed.
+        KeyboardInterrupt: passed on once all runs have saved themselves.
+    """
+    todo = [run for run in runs if not run.finished]
+    if not todo:
+        return []
+    _record(todo)
+    with tqdm(total=sum(run.steps for run in todo), unit="step", dynamic_ncols=True) as bar:
+
+        def show() -> None:
+            done = sum(run.finished for run in todo)
+            bar.n = sum(_steps_done(run) for run in todo)
+            bar.set_description_str(f"{done} of {len(todo)} runs", refresh=False)
+            bar.refresh()
+
+        bar.n = bar.initial = sum(_steps_done(run) for run in todo)
+        results = _on_ray(todo, ray, cpus, gpus, show) if ray else _here(todo, workers, show)
+        return [
+            f"{run.folder.name}: {error}" for run, error in zip(todo, results, strict=True) if error
+        ]
+
+
+def _record(runs: Sequence[Run]) -> None:
+    """Make the demonstrations that are not there, once for all runs that share them."""
+    from regil_sb3.recording import record_expert
+
+    missing = {run.demo: run for run in runs if not Path(run.demo).exists()}
+    for demo, run in tqdm(missing.items(), desc="demonstrations", disable=not missing):
+        Path(demo).parent.mkdir(parents=True, exist_ok=True)
+        record_expert(run.env, run.seed).save(demo)
+
+
+def _steps_done(run: Run) -> int:
+    """As far as its log says; it is written every few episodes."""
+    if run.finished:
+        return run.steps
+    try:
+        with (run.folder / "progress.csv").open(newline="") as file:
+            steps = [row["time/total_timesteps"] for row in csv.DictReader(file)]
+        return int(float(steps[-1]))
+    except (OSError, KeyError, IndexError, ValueError):
+        return 0
+
+
+def _here(runs: Sequence[Run], workers: int, show: Callable[[], None]) -> list[str]:
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(finish, run) for run in runs]
+        try:
+            while wait(futures, _SHOWN_EVERY).not_done:
+                show()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        show()
+    return [str(future.exception() or "") for future in futures]
+
+
+def _on_ray(
+    runs: Sequence[Run], address: str, cpus: float, gpus: float, show: Callable[[], None]
+) -> list[str]:
+    try:
+        import ray  # type: ignore[import-not-found]
+    except ModuleNotFoundError as error:
+        raise ImportError(f"Ray is not installed ({error}): pip install 'regil-sb3[ray]'") from None
+    if not ray.is_initialized():
+        ray.init(address=None if address == "local" else address, log_to_driver=False)
+    task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=_AGAIN)(finish)
+    pending = references = [task.remote(run) for run in runs]
+    while pending:
+        _, pending = ray.wait(pending, num_returns=len(pending), timeout=_SHOWN_EVERY)
+        show()
+    errors = []
+    for reference in references:
+        try:
+            ray.get(reference)
+            errors.append("")
+        except ray.exceptions.RayError as error:
+            errors.append(str(error).strip().splitlines()[-1])
+    return errors

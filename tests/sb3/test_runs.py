@@ -1,0 +1,116 @@
+"""Training runs that are kept, shared by tables, and finished once."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as parquet
+import pytest
+from toy import demonstration
+
+from regil_sb3 import bench_runs
+from regil_sb3.cli import main
+from regil_sb3.runs import Run, finish_all, predicted_hours, seconds_of
+
+TINY = (
+    "warmup_steps=60",
+    "learning_starts=20",
+    "bc_pretrain_steps=3",
+    "batch_size=8",
+    "eval_episodes=2",
+)
+HERE = str(Path(__file__).parent)
+
+
+def toy_run(root, method="ReGIL", seed=0, steps=150, **changes):
+    demo = root / "demo.hdf5"
+    if not demo.exists():
+        demonstration().save(demo)
+    told = {"episodes": 3, "preset": "plain", "settings": TINY, **changes}
+    return Run(str(root), "toy_registered:Toy/Reach-v0", method, seed, steps, str(demo), **told)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two that can be made, and one that cannot."""
+    root = tmp_path_factory.mktemp("runs")
+    return [toy_run(root), toy_run(root, seed=1), toy_run(root, "bad", settings=("k=0",))]
+
+
+@pytest.fixture(scope="module")
+def failed(runs):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")]))
+        assert predicted_hours(runs, 1) == pytest.approx(450 * 0.06 / 3600)
+        return finish_all(runs, workers=2)
+
+
+def test_runs_are_finished_once_and_failures_are_named(runs, failed):
+    assert len(failed) == 1
+    assert failed[0].startswith("Reach-bad-0-150: ")
+    assert "k=0" in (runs[2].folder / "log.txt").read_text()
+    assert [run.finished for run in runs] == [True, True, False]
+    took = [seconds_of(run) for run in runs]
+    assert min(took) > 0
+    assert predicted_hours(runs, 1) == pytest.approx(150 * sum(took[:2]) / 300 / 3600)
+    written = (runs[0].folder / "evaluation.json").stat().st_mtime_ns
+    assert finish_all(runs[:2]) == []
+    assert (runs[0].folder / "evaluation.json").stat().st_mtime_ns == written
+
+
+def test_tables_are_what_evaluations_say(tmp_path):
+    def done(task, method, seed, successes, reached):
+        run = Run(str(tmp_path), f"regil/metaworld-{task}-v0", method, seed, 15_000, "")
+        run.folder.mkdir()
+        policy = {"successes": successes, "lengths": [9] * len(successes)}
+        (run.folder / "evaluation.json").write_text(json.dumps({"policy": policy}))
+        log = "time/total_timesteps,eval/success_rate\n2500,\n5000,0.5\n"
+        (run.folder / "progress.csv").write_text(log + (f"{reached},0.9\n" if reached else ""))
+        return run
+
+    yes, no = [True] * 4, [False] * 4
+    runs = [
+        done("button-press", "ReGIL", 0, yes, 7_500),
+        done("button-press", "ReGIL", 1, [*yes[:3], False], 10_000),
+        done("hammer", "ReGIL", 0, yes, None),
+        done("hammer", "RL", 0, no, None),
+        Run(str(tmp_path), "regil/metaworld-hammer-v0", "RL", 1, 15_000, ""),  # not made yet
+    ]
+    head, _, ours, rl = bench_runs.table(runs)
+    assert head.startswith("| method | button-press | hammer | IQM")
+    cells = [cell.strip() for cell in ours.strip("|").split("|")]
+    assert cells[:3] == ["ReGIL", "0.875 (0.97)", "1.000 (0.91)"]
+    assert cells[4:7] == ["3", "10,000", "-"]
+    assert [cell.strip() for cell in rl.strip("|").split("|")][:3] == ["RL", "-", "0.000"]
+    assert len(list(bench_runs.raw(runs))) == 16
+
+
+def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", "ablations", "--dry-run"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 2 * 2 * 5 + 1
+    assert said[-1] == "20 of 20 runs to make: about 5.0 hours, 1 at a time"
+    assert any("--set warmup_steps=0 --set guide_again=0 --set bc_coef=0" in line for line in said)
+    assert not list(tmp_path.iterdir())
+    for words in (["--methods", "magic"], ["--workers", "0"], ["--plot", "x"]):
+        assert main(["bench", "ablations", *words]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_what_is_written(runs, failed, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_runs, "planned", lambda *_, **__: runs[:2])
+    bench_runs.main("ablations", out=str(tmp_path))
+    rows = parquet.read_table(tmp_path / "ablations.parquet").to_pylist()
+    assert len(rows) == 2 * 3
+    assert {row["seed"] for row in rows} == {0, 1}
+    text = (tmp_path / "ablations.md").read_text()
+    assert "regil bench ablations" in text
+    assert "commit" in text
+    assert np.mean([row["success"] for row in rows]) == pytest.approx(
+        float(text.split("| ReGIL | ")[1].split(" ")[0]), abs=1e-3
+    )
+    assert (tmp_path / "ablations.tex").read_text().count(r"\\") == 2
