@@ -39,6 +39,8 @@ test-oldest:
 	.venv-oldest/bin/python -m pip install --quiet -c constraints-oldest.txt \
 	    $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
 	.venv-oldest/bin/python -m pip install --quiet -c constraints-oldest.txt -e ./wrappers -e '.[tests]'
+	.venv-oldest/bin/python -m pip install --quiet --no-deps -c constraints-oldest.txt \
+	    robosuite hf-libero bddl
 	.venv-oldest/bin/python -m pytest -m "not slow and not packaging"
 
 clean:

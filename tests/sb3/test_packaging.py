@@ -2,6 +2,7 @@
 
 import configparser
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -13,6 +14,9 @@ from pathlib import Path
 
 import pytest
 import regil_wrappers
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 import regil_sb3
 
@@ -43,6 +47,25 @@ def test_regil_sb3_pins_regil_wrappers_to_its_own_version():
     assert [line.replace(" ", "") for line in wanted] == [
         f"regil-wrappers=={regil_sb3.__version__}"
     ]
+
+
+def test_the_oldest_versions_that_are_tested_are_those_allowed():
+    text = (ROOT / "constraints-oldest.txt").read_text("utf-8")
+    pins = {canonicalize_name(n): Version(v) for n, v in re.findall(r"^(\S+)==(\S+)", text, re.M)}
+    tried = 0
+    for name in ("setup.cfg", "wrappers/setup.cfg"):
+        setup = _setup(ROOT / name)
+        runs = [setup["options"]["install_requires"]]
+        extras = setup["options.extras_require"]
+        runs += [wanted for extra, wanted in extras.items() if extra not in ("docs", "tests")]
+        for requirement in map(Requirement, filter(None, "\n".join(runs).split("\n"))):
+            for bound in requirement.specifier:
+                if bound.operator == ">=":
+                    allowed = Version(bound.version).release
+                    tested = pins.get(canonicalize_name(requirement.name), Version("0")).release
+                    assert tested[: len(allowed)] == allowed, f"pin the oldest {requirement}"
+                    tried += 1
+    assert tried > 30
 
 
 def test_zoo_configs_are_found_where_the_package_is_installed():
