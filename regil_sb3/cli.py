@@ -88,6 +88,12 @@ def _parser() -> argparse.ArgumentParser:
     doctor.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="as for train"
     )
+    doctor.add_argument(
+        "--search",
+        nargs="*",
+        metavar="ENCODER",
+        help="try encoders (those that need no download), k and horizon, and recommend",
+    )
     doctor.add_argument("--html", type=Path, metavar="FILE", help="write a page, too")
 
     train = commands.add_parser("train", help="learn, evaluate, and write a report")
@@ -359,7 +365,9 @@ def _doctor(args: argparse.Namespace) -> int:
 
     process.set_threads()
     overrides = [*args.set, *([] if args.image is None else [f"image={args.image}"])]
-    return doctor.main(args.env, args.demo, args.episodes, overrides, args.preset, args.html)
+    return doctor.main(
+        args.env, args.demo, args.episodes, overrides, args.preset, args.html, args.search
+    )
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -37,6 +37,7 @@ from regil_sb3.doctor_pictures import (
     said_of,
 )
 from regil_sb3.doctor_rewards import Reward, check_reward, judged, played_demonstration, signals
+from regil_sb3.doctor_search import Filmed, candidates, search
 from regil_sb3.evaluation import SELECTION_SEED
 from regil_sb3.findings import Finding, listed, status, table
 from regil_sb3.replay_buffer import frame_bytes
@@ -60,6 +61,7 @@ def examine(
     demo: Demonstration | str | Path,
     episodes: int = 5,
     progress: Say | None = None,
+    encoders: Sequence[str] | None = None,
 ) -> list[Finding]:
     """Examine a demonstration for an environment.
 
@@ -79,6 +81,8 @@ def examine(
         demo: the demonstration, or its file.
         episodes: of the guide, plain and corrected each; at least 1.
         progress: called with what is done next.
+        encoders: to try, each with several k and horizon; none: those that need no download. None
+            tries nothing.
 
     Returns:
         a finding for each check that could be made.
@@ -102,7 +106,7 @@ def examine(
         if not isinstance(env.action_space, gym.spaces.Box):
             line = f"none were played: actions are {env.action_space}, not continuous (a Box)"
             return [*found, Finding("episodes", "warning", line)]
-        found += _Episodes(env, demo, settings, episodes, say).examined(embedded)
+        found += _Episodes(env, demo, settings, episodes, say, encoders).examined(embedded)
         # Where something is wrong, settings are no cure
         return [f for f in found if f.check != "recommended" or not status(found)]
     finally:
@@ -170,8 +174,17 @@ class _Episodes:
     """Plays what has to be played. The environment serves one wrapper after the other."""
 
     def __init__(
-        self, env: Env, demo: Demonstration, settings: Settings, episodes: int, say: Say
+        self,
+        env: Env,
+        demo: Demonstration,
+        settings: Settings,
+        episodes: int,
+        say: Say,
+        encoders: Sequence[str] | None,
     ) -> None:
+        self._encoders = None if encoders is None else candidates(encoders, settings)
+        if encoders is not None:
+            env = Filmed(env, demo, settings.retrieval("image"))
         self._env, self._demo, self._settings, self._say = env, demo, settings, say
         self._seeds = [SELECTION_SEED + i for i in range(episodes)]
         self._longest = max(200, 5 * len(demo))
@@ -207,7 +220,19 @@ class _Episodes:
             found.append(check_guide(plain, corrected, said))
         rewards = self._rewards(env, guided)
         found += check_reward(rewards, self._settings.retrieval("reward"))
-        found.append(_recommended(rewards, plain, corrected))
+        words = ""
+        if self._encoders is not None:
+            more, words = search(
+                self._demo,
+                self._settings,
+                self._encoders,
+                self._groups,
+                self._gamma,
+                self._guided_by,
+                self._say,
+            )
+            found += more
+        found.append(_recommended(rewards, plain, corrected, words))
         found.append(_expected(self._env, self._settings, self._seconds / self._steps))
         return found
 
@@ -284,10 +309,21 @@ class _Episodes:
         successes = successes or [played_demonstration(env.retriever)]
         failures = [p for p in (*guided, *disturbed) if not p.success]
         limit = max(p.steps for p in (*still, *failures))
-        gamma = self._settings.hyperparams.get("gamma", _default("gamma"))
+        self._groups = successes, failures, still
         return [
-            judged(name, successes, failures, still, gamma, limit) for name in successes[0].rewards
+            judged(name, successes, failures, still, self._gamma, limit)
+            for name in successes[0].rewards
         ]
+
+    @property
+    def _gamma(self) -> float:
+        return float(self._settings.hyperparams.get("gamma", _default("gamma")))
+
+    def _guided_by(self, settings: Settings) -> list[bool]:
+        """Successes of plain guided replay with other settings."""
+        own = self._arguments(settings.plain(), RetrievalGuideWrapper)
+        env: Any = RetrievalGuideWrapper(self._env, self._demo, **own)
+        return [played.success for played in self._guided("plain guide", env)]
 
 
 def _default(name: str) -> Any:
@@ -295,7 +331,10 @@ def _default(name: str) -> Any:
 
 
 def _recommended(
-    rewards: Sequence[Reward], plain: list[bool] | None, corrected: list[bool] | None
+    rewards: Sequence[Reward],
+    plain: list[bool] | None,
+    corrected: list[bool] | None,
+    searched: str,
 ) -> Finding:
     """What to set."""
     words = [f"--set reward={max(rewards, key=lambda reward: reward.rank).name}"]
@@ -305,7 +344,7 @@ def _recommended(
             words.append("--set correction=servo")
         elif without > with_it:
             words.append("--set correction=none --set disturbance=0")
-    return Finding("recommended", "ok", " ".join(words))
+    return Finding("recommended", "ok", " ".join([*words, *([searched] if searched else [])]))
 
 
 def _expected(env: Env, settings: Settings, seconds: float) -> Finding:
@@ -336,6 +375,7 @@ def main(
     overrides: Iterable[str] = (),
     preset: str | None = None,
     html: Path | None = None,
+    encoders: Sequence[str] | None = None,
 ) -> int:
     """Examine, print a table, write a page.
 
@@ -346,6 +386,7 @@ def main(
         overrides: "KEY=VALUE", as of `make_settings`.
         preset: a section of ``zoo_configs/td3bc.yml``.
         html: file of the page; None writes none.
+        encoders: as of `examine`.
 
     Returns:
         0 where nothing is wrong, 1 where something is.
@@ -359,7 +400,7 @@ def main(
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
-    found = examine(settings, read, episodes, say)
+    found = examine(settings, read, episodes, say, encoders)
     print(table(found, shutil.get_terminal_size((100, 24)).columns))
     counts = {v: [f.verdict == v for f in found] for v in ("wrong", "warning", "ok")}
     print("\n" + ", ".join(f"{listed(c)} {v}" for v, c in counts.items()))

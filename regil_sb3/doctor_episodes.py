@@ -44,12 +44,14 @@ class Played:
         rewards: by name, (steps,) each.
         embeddings: (steps + 1, D) float32, of its pictures.
         seconds: it took, all together.
+        film: its pictures, in each size that was kept; empty where none were.
     """
 
     success: bool = False
     rewards: dict[str, list[float]] = field(default_factory=dict)
     embeddings: list[npt.NDArray[np.float32]] = field(default_factory=list)
     seconds: float = 0.0
+    film: Sequence[Sequence[npt.NDArray[np.uint8]]] = ()
 
     @property
     def steps(self) -> int:
@@ -88,6 +90,8 @@ def play(
         played.success |= bool(info.get("is_success", terminated))
         over = terminated or truncated
     played.seconds = time.perf_counter() - begun
+    if env.has_wrapper_attr("film"):
+        played.film = env.get_wrapper_attr("film")
     return played
 
 

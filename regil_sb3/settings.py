@@ -91,6 +91,13 @@ class Settings:
                     return arguments[name]
         return inspect.signature(RetrievalRewardWrapper).parameters[name].default
 
+    def overridden(self, words: list[str]) -> Settings:
+        """The same with "KEY=VALUE" on top, as of `make_settings`."""
+        settings = copy.deepcopy(self)
+        for key, value in pairs(words).items():
+            _override(settings, key, value)
+        return settings
+
     def plain(self) -> Settings:
         """The same with the demonstrator's actions and pictures as they are: the plain guide."""
         settings = copy.deepcopy(self)

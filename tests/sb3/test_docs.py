@@ -18,7 +18,7 @@ import pytest
 import torch as th
 from regil_wrappers import make_encoder
 from regil_wrappers.encoders import cache, encoder_names, registry
-from regil_wrappers.encoders.timm_networks import _import_timm
+from regil_wrappers.encoders.timm_networks import import_timm
 
 from regil_sb3.cli import _parser, main
 from regil_sb3.settings import make_settings
@@ -220,7 +220,7 @@ def test_the_readme_names_every_command():
 
 
 def test_the_table_of_encoders():
-    timm = _import_timm()
+    timm = import_timm()
     row = re.compile(r"\| (`[^|]+`) \| `([^`]+)` \| ([\d.]+) \| (\d+) \| (\d+) \| ([\dx ]+) \|")
     listed = {}
     for names, *rest in row.findall(PAGES["docs/encoders.md"]):

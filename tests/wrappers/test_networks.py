@@ -21,13 +21,13 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 from regil_wrappers import Demonstration, RetrievalRewardWrapper, Retriever, make_encoder
 from regil_wrappers.encoders import registry
-from regil_wrappers.encoders.timm_networks import _import_timm
+from regil_wrappers.encoders.timm_networks import import_timm
 from regil_wrappers.vector import RetrievalRewardWrapper as VectorReward
 from toy_env import ToyReach
 
 if find_spec("timm") is None:
     pytest.skip("timm is not installed", allow_module_level=True)
-timm = _import_timm()
+timm = import_timm()
 import safetensors.torch as safetensors  # noqa: E402
 import torch  # noqa: E402
 

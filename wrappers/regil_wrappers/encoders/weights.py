@@ -1,7 +1,8 @@
 """Where a network's weights lie: a file that was named, the user's folder, the hub's cache.
 
 * ``weights_folder`` - the user's folder: ``REGIL_ENCODERS``
-* ``find_weights``, ``timm_weights`` - the path of a file, or one line that says what to put where
+* ``find_weights``, ``local_weights``, ``timm_weights`` - the path of a
+  file, or one line that says what to put where
 * ``read_weights`` - the tensors of a checkpoint; never other objects
 """
 
@@ -15,7 +16,7 @@ from typing import Any
 from regil_wrappers.encoders.cache import cache_folder
 from regil_wrappers.encoders.network import import_torch
 
-__all__ = ["find_weights", "read_weights", "timm_weights", "weights_folder"]
+__all__ = ["find_weights", "local_weights", "read_weights", "timm_weights", "weights_folder"]
 
 # What a repository of timm's holds, unless timm says otherwise; older ones have the second alone.
 _HUB_NAMES = ("model.safetensors", "pytorch_model.bin")
@@ -40,6 +41,33 @@ def find_weights(name: str, file: str | None) -> Path | None:
     return path if path.is_file() else None
 
 
+def local_weights(timm: Any, model: str, file: str | None = None) -> Path | None:
+    """The same where they are here already; None where they would have to be downloaded.
+
+    Raises:
+        ValueError: if the named file does not exist.
+    """
+    config = timm.get_pretrained_cfg(model)
+    full = _full_name(config)
+    found = find_weights(f"{full}.safetensors", file) or find_weights(f"{full}.bin", None)
+    if found is not None or not config.hf_hub_id:
+        return found
+    hub = import_module("huggingface_hub")
+    for name in _hub_names(config):
+        cached = hub.try_to_load_from_cache(config.hf_hub_id, name)
+        if isinstance(cached, str):
+            return Path(cached)
+    return None
+
+
+def _full_name(config: Any) -> str:
+    return str(config.architecture) + (f".{config.tag}" if config.tag else "")
+
+
+def _hub_names(config: Any) -> list[str]:
+    return [config.hf_hub_filename] if config.hf_hub_filename else list(_HUB_NAMES)
+
+
 def timm_weights(timm: Any, model: str, file: str | None) -> Path:
     """The file with the weights of a model of timm's: downloaded, if nothing else helps.
 
@@ -48,20 +76,16 @@ def timm_weights(timm: Any, model: str, file: str | None) -> Path:
     Raises:
         ValueError: of one line, if they are neither here nor to be downloaded.
     """
-    config = timm.get_pretrained_cfg(model)
-    full = config.architecture + (f".{config.tag}" if config.tag else "")
-    found = find_weights(f"{full}.safetensors", file) or find_weights(f"{full}.bin", None)
+    found = local_weights(timm, model, file)
     if found is not None:
         return found
+    config = timm.get_pretrained_cfg(model)
+    full = _full_name(config)
     repository = config.hf_hub_id
     if not repository:
         raise ValueError(f"timm has no weights for {model!r}: add '@' and a checkpoint's path")
-    names = [config.hf_hub_filename] if config.hf_hub_filename else list(_HUB_NAMES)
+    names = _hub_names(config)
     hub = import_module("huggingface_hub")
-    for name in names:
-        cached = hub.try_to_load_from_cache(repository, name)
-        if isinstance(cached, str):
-            return Path(cached)
     for name in names:
         try:
             hub.get_hf_file_metadata(hub.hf_hub_url(repository, name), timeout=5)
