@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from regil_wrappers.apart import Apart, register_apart, taken_up
+from regil_wrappers.apart import Apart, arm_at_start, register_apart, round_point, taken_up
 from regil_wrappers.path import Path
 from regil_wrappers.registration import Displacement
 from test_registration import SIZE, paste, textured
@@ -136,3 +136,31 @@ def test_a_path_without_a_grasp() -> None:
     assert len(after) == 30
     assert path().gripper_moves(15, 20)
     assert not path().gripper_moves(15, 19)
+
+
+def test_what_moves_elsewhere_does_not_count() -> None:
+    """A third thing, larger than both, goes its own way."""
+
+    def crowded(third: Any, *moved: Any) -> Any:
+        picture = scene(*moved).astype(np.float32)
+        picture = paste(picture, textured(24, 8), np.array([64.0, 66.0]) + third)
+        return picture.round().clip(0, 255).astype(np.uint8)
+
+    first, later = crowded((0, 0)), crowded((5, 5), (6, -3), (-7, 4))
+    near = round_point((SIZE, SIZE), CUP, 14) | round_point((SIZE, SIZE), SHELF, 18)
+    found = register_apart(first, later, taken(), near)
+    assert off_by(found.taken, (6, -3)) < 0.5
+    assert off_by(found.place, (-7, 4)) < 0.5
+    everywhere = register_apart(first, later, taken())
+    assert off_by(everywhere.place, (-7, 4)) > 2
+
+
+def test_the_arm_is_what_leaves_before_the_grasp() -> None:
+    def with_arm(x: float, cup: Any = (0, 0)) -> Any:
+        picture = paste(scene(cup).astype(np.float32), textured(12, 6), np.array([x, 14.0]))
+        return picture.round().clip(0, 255).astype(np.uint8)
+
+    pictures = np.stack([with_arm(14)] + [with_arm(60)] * 9 + [with_arm(60, None)] * 12)
+    arm = arm_at_start(pictures, 9)
+    assert arm[10:18, 10:18].all()
+    assert not arm[50:62, 22:34].any()  # the cup goes later

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import toy_camera
 from regil_wrappers import Demonstration, RetrievalGuideWrapper, calibration
+from regil_wrappers.correction import Servo
 from regil_wrappers.pinhole import Pinhole, fit_pinhole
 from toy_camera import HOME, ToyCamera
 
@@ -414,3 +415,38 @@ def test_another_scene(demo: Demonstration, known: dict[str, Any]) -> None:
         successes(env, range(3))
     assert len(said) == 1
     assert env._servo.kind == "plain"
+
+
+def test_a_hand_that_starts_elsewhere(demo: Demonstration, known: dict[str, Any]) -> None:
+    env = ready(demo, known, start=1.5)
+    off = []
+    for seed in range(6):
+        env.reset(seed=seed)
+        found = env.unwrapped.hand - env._servo._hand
+        off.append(np.abs(found[:2]).max() if env._servo.kind == "corrected" else 0.0)
+    assert np.median(off) < 0.8
+    seen = successes(env, range(10))
+    env.unwrapped.metadata["regil"].pop("start_std")
+    unseen = guided(demo, start=1.5)
+    unseen._servo._start_std = None
+    unseen.set_calibration(known)
+    assert seen >= 7
+    assert seen > successes(unseen, range(10))
+
+
+def test_a_place_that_takes_several_steps_turns_the_hand_once(known: dict[str, Any]) -> None:
+    """The hand is held up by a long way to go: its turn does not go on meanwhile."""
+    actions = np.zeros((20, 7), np.float32)
+    actions[:, 0], actions[:10, 4], actions[:, 6] = 1.0, 0.3, -1
+    ones = np.ones(7, np.float32)
+    servo = Servo((84, 84), actions, -ones, ones, gripper_dim=6, rotation_dims=[3, 4, 5])
+    servo.load_state(known)
+    servo.reset(kind="corrected")
+    servo.target_shift = np.array([0.0, 8.0, 0.0])
+    turned, picture = np.zeros(3), np.zeros((84, 84, 3), np.uint8)
+    for _ in range(30):
+        action = servo.action()
+        assert action is not None
+        turned += action[3:6]
+        servo.executed(action, action, picture)
+    assert turned == pytest.approx([0, 3, 0], abs=1e-5)

@@ -60,7 +60,8 @@ class ToyCamera(gym.Env[Any, np.ndarray]):
     `decoy`: only the picture of the square moves, what has to be touched does not. `dead`: a
     dimension that does nothing. `absolute`: actions are places. `look`: "mirrored" left to right.
     `pan`: px by which the camera is turned. `distance`: of the camera, 1 where it
-    usually stands. `axes`: how far the square moves along each.
+    usually stands. `axes`: how far the square moves along each. `start`: how far from its place the
+    hand starts, along each axis; declared where `declares` is.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -79,13 +80,14 @@ class ToyCamera(gym.Env[Any, np.ndarray]):
         light: float = 1.0,
         distance: float = 1.0,
         axes: tuple[float, float, float] = (SPREAD, SPREAD, 0.0),
+        start: float = 0.0,
         declares: bool = True,
         max_steps: int = 70,
     ) -> None:
         self.task, self.frozen, self.render_mode, self.obs = task, frozen, render_mode, obs
         self.decoy, self.dead, self.absolute, self.look = decoy, dead, absolute, look
         self.pan, self.light, self.axes, self.max_steps = pan, light, np.array(axes), max_steps
-        self.distance = distance
+        self.distance, self.start = distance, start
         self.action_space = gym.spaces.Box(-1, 1, (4,), np.float32)
         picture = gym.spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)
         state = gym.spaces.Box(-np.inf, np.inf, (6,), np.float32)
@@ -102,6 +104,8 @@ class ToyCamera(gym.Env[Any, np.ndarray]):
                 "plane": [8.0, 8.0, 0.5],
                 "mirror": 1,
             }
+            if start:
+                said["start_std"] = [start] * 3
             self.metadata = {**self.metadata, "regil": said}
 
     def render(self) -> np.ndarray:
@@ -130,7 +134,7 @@ class ToyCamera(gym.Env[Any, np.ndarray]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
-        self.hand = np.zeros(3)
+        self.hand = self.start * self.np_random.normal(size=3) if self.start else np.zeros(3)
         self.square = HOME.copy()
         if not self.frozen:
             self.square += self.axes * self.np_random.uniform(-1, 1, 3)

@@ -2,6 +2,7 @@
 
 * ``Apart`` - how far each has moved
 * ``taken_up`` - the pixels of the demonstration's first picture that show what it takes up
+* ``arm_at_start`` - the pixels of it that show the arm
 * ``register_apart`` - finds both
 
 Points, shifts and lengths "at 84 pixels" as in `regil_wrappers.registration`.
@@ -33,13 +34,15 @@ from regil_wrappers.matching import (
 )
 from regil_wrappers.registration import Displacement
 
-__all__ = ["Apart", "register_apart", "taken_up"]
+__all__ = ["Apart", "arm_at_start", "register_apart", "round_point", "taken_up"]
 
 Mask = NDArray[np.bool_]
 Shifts = NDArray[np.int_]
 
 _LIFTED = 8  # steps after the gripper closes: what it holds has left its place
 _GONE = 0.75  # of the pictures after that in which a pixel must differ from the first
+_LEFT = 0.6  # of the pictures on the way to the grasp in which a pixel of the arm differs
+_ROUND_ARM = 7  # px at 84 pixels, the side by which these are widened
 _REACH = 26  # px at 84 pixels: shifts up to this are looked for
 _CAP = 60.0  # of 255: a pixel that is off by more is off by this
 _PULL = 0.4  # error (of 255) of each changed pixel that a pixel of shift must save
@@ -67,8 +70,12 @@ class Apart:
 
     def believed(self, worst: float) -> bool:
         """Whether more moved than what is taken up, each with a ratio of at most ``worst``."""
-        found = (self.taken, self.place)
-        return self.place is not None and all(one is None or one.ratio <= worst for one in found)
+        return self.place is not None and self.worst <= worst
+
+    @property
+    def worst(self) -> float:
+        """The larger of their ratios; 0 where nothing moved."""
+        return max((one.ratio for one in (self.taken, self.place) if one is not None), default=0.0)
 
 
 def taken_up(pictures: NDArray[np.uint8], grasp: int) -> Mask:
@@ -89,7 +96,34 @@ def taken_up(pictures: NDArray[np.uint8], grasp: int) -> Mask:
     return gone
 
 
-def register_apart(reference: Picture, picture: Picture, taken: Mask) -> Apart:
+def arm_at_start(pictures: NDArray[np.uint8], grasp: int) -> Mask:
+    """The pixels of the first picture that show the arm, and those near them.
+
+    They are those whose content is gone while the hand is on its way, before it is where it grasps.
+
+    Args:
+        pictures: (T, H, W, 3) uint8, a demonstration's.
+        grasp: the step in which the gripper closes.
+
+    Returns:
+        (H, W) bool.
+    """
+    first = pictures[0].astype(np.float32)
+    on_the_way = pictures[max(1, grasp // 4) : max(2, 2 * grasp // 3)].astype(np.float32)
+    gone = (np.abs(on_the_way - first).max(axis=3) > DIFFERENT).mean(axis=0) > _LEFT
+    unit = min(first.shape[:2]) / 84
+    return np.asarray(cv2.dilate(gone.astype(np.uint8), square(_ROUND_ARM, unit)) > 0)
+
+
+def round_point(shape: tuple[int, int], point: Point, radius: float) -> Mask:
+    """(H, W) bool: the pixels within a radius, px at 84 pixels, of a point (x, y)."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    return np.asarray(np.hypot(x - point[0], y - point[1]) <= radius * min(shape) / 84)
+
+
+def register_apart(
+    reference: Picture, picture: Picture, taken: Mask, among: Mask | None = None
+) -> Apart:
     """How far what is taken up has moved, and how far what else has.
 
     The two shifts are sought that together explain the most of what differs: each pixel of what is
@@ -100,11 +134,12 @@ def register_apart(reference: Picture, picture: Picture, taken: Mask) -> Apart:
         reference: (H, W, 3) uint8, the demonstration's first picture.
         picture: (H, W, 3) uint8, the episode's first, from the same camera.
         taken: (H, W) bool, of `taken_up`.
+        among: (H, W) bool, the pixels that count; None: all. What is elsewhere may move by itself.
 
     Raises:
         ValueError: if the pictures differ in shape or are not uint8 (H, W, 3).
     """
-    pair = comparable(reference, picture)
+    pair = comparable(reference, picture, among)
     if pair.changed is None:
         return Apart(None, None)
     mask = taken.astype(np.float32)

@@ -5,8 +5,8 @@
   demonstrated path shifted by that much
 
 It is given pictures and says actions. It assumes a fixed camera, an arm that starts each episode in
-the same pose, translations that are deltas, and one target that moved; or two, where a gripper
-takes up the one and brings it to the other.
+about the same pose, translations that are deltas, and one target that moved; or two, where a
+gripper takes up the one and brings it to the other.
 """
 
 from __future__ import annotations
@@ -65,6 +65,10 @@ class Servo:
         settle_time: s that a calibration move is given to come to rest.
         rotation_dims: dimensions that turn the hand, as deltas: a place of the path that takes more
             than one step must not turn it more than once.
+        start_std: (3,) action units, standard deviations of where the hand starts an episode; None:
+            always in one place.
+        crowded: whether other things move too, so that only what stands where the demonstration
+            grasps and where it ends is looked at.
         disturbance: in every other episode `disturbed` pushes the hand off its way now and then, by
             up to so many action units, so that who learns from `action` sees how to come back; 0:
             never.
@@ -87,6 +91,8 @@ class Servo:
         control_rate: float | None = None,
         settle_time: float = 0.1,
         rotation_dims: Iterable[int] = (),
+        start_std: Iterable[float] | None = None,
+        crowded: bool = False,
         disturbance: float = 0.0,
         seed: int | None = None,
     ) -> None:
@@ -103,6 +109,8 @@ class Servo:
         self._limit = np.minimum(-low, high)[self._dims].astype(float)
         deltas = np.clip(actions[:, self._dims].astype(float), -self._limit, self._limit)
         self._path = Path(deltas, None if gripper_dim is None else actions[:, gripper_dim])
+        self._start_std = None if start_std is None else np.array(list(start_std), float)
+        self._crowded = crowded
         self._rotations = list(rotation_dims)
         self._turns: Floats = np.cumsum(actions[:, self._rotations].astype(float), axis=0)
         self._mirrors = (1, -1) if mirror == "auto" else (mirror,)
@@ -137,6 +145,21 @@ class Servo:
         """The step in which the demonstration's open gripper closes; None where none does."""
         return self._path.grasp
 
+    @property
+    def hand_pixel(self) -> Floats | None:
+        """(2,) px, where the hand starts; None where it always starts there, or is not known."""
+        if self._start_std is None or not self.cameras:
+            return None
+        return np.array(next(iter(self.cameras.values())).hand)
+
+    @property
+    def near(self) -> tuple[Floats, Floats] | None:
+        """(2,) px each, where the demonstration grasps and where it ends; None: look everywhere."""
+        if not self._crowded or self.grasp is None or not self.cameras:
+            return None
+        camera, places = next(iter(self.cameras.values())), self._path.places
+        return camera.project(places[self.grasp]), camera.project(places[-1])
+
     # Of an episode
     target_shift: Floats  # action units: where the target is believed to have gone
     place_shift: Floats  # action units: where what is taken up is to be brought has gone
@@ -154,6 +177,7 @@ class Servo:
         displacement: Displacement | None = None,
         apart: Apart | None = None,
         kind: str | None = None,
+        hand: Floats | None = None,
     ) -> None:
         """Begin an episode.
 
@@ -162,13 +186,14 @@ class Servo:
                 picture and this episode's; not used before `calibrated`.
             apart: what `apart.register_apart` found, where there is a `grasp`; likewise.
             kind: "corrected", "released" or "plain" in place of a choice between them.
+            hand: (2,) px, how far the hand's picture is from where the demonstration's started.
         """
         self._begin_episode()
         if self._calibration is not None:
             self._moving = True
             self._calibration.begin()
         else:
-            self._begin_replay(displacement, apart, kind)
+            self._begin_replay(displacement, apart, kind, hand)
 
     def disturbed(self) -> NDArray[np.float32] | None:
         """What to execute now where `action` is what to learn; None where they are the same."""
@@ -303,14 +328,25 @@ class Servo:
     # -- replaying -------------------------------------------------------------------------------
 
     def _begin_replay(
-        self, found: Displacement | None, apart: Apart | None, kind: str | None
+        self,
+        found: Displacement | None,
+        apart: Apart | None,
+        kind: str | None,
+        hand: Floats | None,
     ) -> None:
         seen = apart if apart is not None and apart.believed(_WORST_RATIO) else None
-        chosen = self._ways.choose(self._rng, seen is not None) if kind is None else None
+        # In a crowded scene a place that was not seen to move stands where it stood
+        speaks = seen is not None or (self._crowded and apart is not None)
+        chosen = self._ways.choose(self._rng, speaks) if kind is None else None
         self._way = chosen or self._ways.best(str(kind))
         # Every other episode goes undisturbed, and tells which way of replaying is best
         self._disturbs = not self._disturbs and self._disturbance > 0
-        if self._way.kind == "plain" or found is None:
+        if self._way.kind == "plain":
+            return
+        if hand is not None and self._start_std is not None:
+            camera = self.cameras[self._way.mirror]
+            self._hand, _ = solve_displacement(camera, np.zeros(3), hand, None, self._start_std)
+        if found is None:
             return
         if found.changed > _ELSEWHERE:
             self._way = self._ways.plain
@@ -319,6 +355,10 @@ class Servo:
                     f"{found.changed:.0%} of the picture differ from the demonstration's: camera "
                     "or scene are others; the guide replays without correction while that lasts"
                 )
+            return
+        if self._crowded and apart is not None:
+            if apart.worst > _WORST_RATIO or not self._believes(apart):
+                self._way = self._ways.plain
             return
         if self._way.kind == "released" and seen is not None and self._believes(seen):
             return

@@ -12,12 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from regil_wrappers.apart import Apart, register_apart, taken_up
+from regil_wrappers.apart import Apart, arm_at_start, register_apart, round_point, taken_up
 from regil_wrappers.frames import FrameSource
-from regil_wrappers.registration import Displacement, moved_back, register
+from regil_wrappers.matching import Point
+from regil_wrappers.registration import Displacement, local_shift, moved_back, register
 from regil_wrappers.retrieval import Retriever
 
 __all__ = ["Episode"]
+
+_TAKEN = 16.0  # px at 84 pixels round where the hand grasps: what is taken up is there
+_PLACE = 14.0  # px at 84 pixels round where what it holds ends
 
 
 class Episode:
@@ -37,6 +41,7 @@ class Episode:
         self._moves_back = moves_back
         self._said_camera = False
         self._taken: NDArray[np.bool_] | None = None
+        self._arm: NDArray[np.bool_] | None = None
         self.begin()
 
     def begin(self) -> None:
@@ -96,11 +101,13 @@ class Episode:
                 )
         return self._displacement
 
-    def apart(self, grasp: int) -> Apart:
+    def apart(self, grasp: int, near: tuple[Point, Point] | None = None) -> Apart:
         """How far what the demonstration takes up has moved, and what else; found anew each time.
 
         Args:
             grasp: the step in which its gripper closes.
+            near: (x, y) px, where the demonstration's hand grasps and where it ends. Then only what
+                stands near them counts, and not the arm: other things may move too. None: all does.
 
         Raises:
             ValueError: before the first picture.
@@ -109,4 +116,28 @@ class Episode:
             raise ValueError("there is no picture yet: call reset() of the environment")
         if self._taken is None:
             self._taken = taken_up(self.frames.recorded, grasp)
-        return register_apart(self.frames.recorded_first, self._first, self._taken)
+        taken, among = self._taken, None
+        if near is not None:
+            if self._arm is None:
+                self._arm = arm_at_start(self.frames.recorded, grasp)
+            at_grasp, at_end = near
+            taken = taken & self._round(at_grasp, _TAKEN) & ~self._arm
+            if taken.any():  # where the hand ends, seen from what it holds
+                ys, xs = np.nonzero(taken)
+                at_end = np.array([xs.mean(), ys.mean()]) + at_end - at_grasp
+            among = (self._round(at_grasp, _TAKEN) | self._round(at_end, _PLACE)) & ~self._arm
+        return register_apart(self.frames.recorded_first, self._first, taken, among)
+
+    def _round(self, point: Point, radius: float) -> NDArray[np.bool_]:
+        height, width = self.frames.recorded_first.shape[:2]
+        return round_point((height, width), point, radius)
+
+    def shift_at(self, point: Point) -> Point:
+        """How far what stands round a point (x, y) px has shifted since the demonstration began.
+
+        Raises:
+            ValueError: before the first picture.
+        """
+        if self._first is None:
+            raise ValueError("there is no picture yet: call reset() of the environment")
+        return local_shift(self.frames.recorded_first, self._first, point)

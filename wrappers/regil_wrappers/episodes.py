@@ -259,9 +259,8 @@ class Guides:
         for i, episode in self.episodes.begun.items():
             alignment = episode.retriever.alignment
             seed = None if seeds is None else seeds[i]
-            self.guides[i].begin(
-                alignment, partial(getattr, episode, "displacement"), episode.apart, seed
-            )
+            displacement = partial(getattr, episode, "displacement")
+            self.guides[i].begin(alignment, displacement, episode.apart, episode.shift_at, seed)
             said[i] = {**said_of(alignment), **self.guides[i].said()}
         return said
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from regil_wrappers.apart import Apart
 from regil_wrappers.correction import Servo
+from regil_wrappers.matching import Point
 from regil_wrappers.registration import Displacement
 from regil_wrappers.retrieval import Alignment
 
@@ -53,7 +54,8 @@ class Guide:
         self,
         alignment: Alignment,
         displacement: Callable[[], Displacement | None],
-        apart: Callable[[int], Apart],
+        apart: Callable[[int, tuple[Point, Point] | None], Apart],
+        shift_at: Callable[[Point], Point],
         seed: int | None = None,
     ) -> None:
         """Begin an episode.
@@ -63,7 +65,8 @@ class Guide:
             displacement: says what has moved since the demonstration began; asked only where a
                 correction uses it.
             apart: says the same of what the demonstration takes up, given the step in which it
-                does, and of what else moved; likewise.
+                does, and of what else moved, perhaps only near two points; likewise.
+            shift_at: says how far what stands round a point has shifted; likewise.
             seed: of the correction's choices; None leaves their stream as it is.
         """
         self._alignment = alignment
@@ -75,8 +78,12 @@ class Guide:
             if not self.servo.calibrated:
                 self.servo.reset()
                 return
-            grasp = self.servo.grasp
-            self.servo.reset(displacement(), None if grasp is None else apart(grasp))
+            grasp, hand = self.servo.grasp, self.servo.hand_pixel
+            self.servo.reset(
+                displacement(),
+                None if grasp is None else apart(grasp, self.servo.near),
+                hand=None if hand is None else shift_at(hand),
+            )
 
     def after(
         self,

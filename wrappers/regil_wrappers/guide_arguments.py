@@ -96,7 +96,7 @@ _DECLARED = {
     "mirror": "auto",
 }
 
-_OF_THE_ARM = ("control_rate", "settle_time", "rotation_dims")
+_SAID_ONLY = ("control_rate", "settle_time", "rotation_dims", "start_std", "crowded")
 
 
 def make_servo(
@@ -125,7 +125,7 @@ def make_servo(
         chosen["gripper_dim"] = None
     box = cast("gym.spaces.Box", space)
     low, high = box.low.astype(np.float32), box.high.astype(np.float32)
-    chosen |= {name: said[name] for name in _OF_THE_ARM if name in said}
+    chosen |= {name: said[name] for name in _SAID_ONLY if name in said}
     try:
         return Servo(size, actions, low, high, disturbance=disturbance, **chosen)
     except ValueError as error:

@@ -73,12 +73,15 @@ class Pair:
     hull: Floats | None
 
 
-def comparable(reference: Picture, picture: Picture) -> Pair:
+def comparable(
+    reference: Picture, picture: Picture, among: NDArray[np.bool_] | None = None
+) -> Pair:
     """Take light and a turn of the camera out, and find what still differs.
 
     Args:
         reference: (H, W, 3) uint8, the first picture.
         picture: (H, W, 3) uint8, the second.
+        among: (H, W) the pixels that count; None: all.
 
     Raises:
         ValueError: if they do not compare.
@@ -96,7 +99,7 @@ def comparable(reference: Picture, picture: Picture) -> Pair:
         reference = warped(reference, matrix, inverse=False)
     a, b = reference.astype(np.float32), match_colours(reference, picture)
     share = float((np.abs(a - b).max(axis=2) > DIFFERENT).mean())
-    changed, hull = _changed(a, b, unit, seen_by_both) or (None, None)
+    changed, hull = _changed(a, b, unit, seen_by_both, among) or (None, None)
     return Pair(a, b, unit, camera, share, changed, hull)
 
 
@@ -131,7 +134,11 @@ def square(side: float, unit: float) -> NDArray[np.uint8]:
 
 
 def _changed(
-    a: Floats, b: Floats, unit: float, seen_by_both: NDArray[np.uint8] | None
+    a: Floats,
+    b: Floats,
+    unit: float,
+    seen_by_both: NDArray[np.uint8] | None,
+    among: NDArray[np.bool_] | None,
 ) -> tuple[Floats, Floats] | None:
     """Pixels that differ, and their convex hull, a little larger; None where too few do.
 
@@ -140,6 +147,8 @@ def _changed(
     everything within a pixel of them.
     """
     changed = (np.abs(a - b).max(axis=2) > DIFFERENT).astype(np.uint8)
+    if among is not None:
+        changed[~among] = 0
     core = changed
     if seen_by_both is not None:
         near = square(3, unit)

@@ -24,6 +24,7 @@ from regil_wrappers.encoders import Encoder, make_encoder
 from regil_wrappers.episode import Episode
 from regil_wrappers.frames import Asked, FrameSource, check_recorded_settings
 from regil_wrappers.latency import Latency
+from regil_wrappers.matching import Point
 from regil_wrappers.registration import Displacement
 from regil_wrappers.retrieval import Alignment, Retriever, check_settings
 
@@ -109,15 +110,23 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
             return cast("Displacement | None", self.env.get_wrapper_attr("displacement"))
         return self._episode.displacement
 
-    def apart(self, grasp: int) -> Apart:
+    def apart(self, grasp: int, near: tuple[Point, Point] | None = None) -> Apart:
         """How far what the demonstration takes up has moved since it began, and what else.
 
         Args:
             grasp: the step in which its gripper closes.
+            near: (x, y) px, where its hand grasps and where it ends: only what stands near them
+                counts. None: everything does.
         """
         if self._frames is None:
-            return cast("Apart", self.env.get_wrapper_attr("apart")(grasp))
-        return self._episode.apart(grasp)
+            return cast("Apart", self.env.get_wrapper_attr("apart")(grasp, near))
+        return self._episode.apart(grasp, near)
+
+    def shift_at(self, point: Point) -> Point:
+        """How far what stands round a point (x, y) px has shifted since the demonstration began."""
+        if self._frames is None:
+            return cast("Point", self.env.get_wrapper_attr("shift_at")(point))
+        return self._episode.shift_at(point)
 
     def _with_retrieval(self, info: dict[str, Any], **own: Any) -> dict[str, Any]:
         inner = info["retrieval"] if self._frames is None else {}

@@ -195,7 +195,9 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
     ) -> tuple[ObsType, dict[str, Any]]:
         """Reset; ``info["retrieval"]`` holds the alignment and the first guide action."""
         observation, info = super().reset(seed=seed, options=options)
-        self._guide.begin(self.alignment, lambda: self.displacement, self.apart, seed)
+        self._guide.begin(
+            self.alignment, lambda: self.displacement, self.apart, self.shift_at, seed
+        )
         return observation, self._with_retrieval(info, **self._guide.said())
 
     def step(self, action: ActType) -> tuple[ObsType, SupportsFloat, bool, bool, dict[str, Any]]:
