@@ -98,11 +98,15 @@ def _parser() -> argparse.ArgumentParser:
 
     train = commands.add_parser("train", help="learn, evaluate, and write a report")
     train.add_argument("--env", help="id of the environment")
-    train.add_argument("--algo", choices=["td3bc"], default="td3bc")
+    train.add_argument(
+        "--algo",
+        choices=["td3bc", "bc", "rot", "baku"],
+        help="takes the preset of its name (td3bc)",
+    )
     train.add_argument("--demo", type=Path, help="demonstration; recorded when it is not there")
     train.add_argument("--seed", type=int, default=0)
     train.add_argument("--out", type=Path, help="run folder (runs/<id after the slash>-<seed>)")
-    train.add_argument("--preset", help="a section of zoo_configs/td3bc.yml")
+    train.add_argument("--preset", help="a section of zoo_configs/td3bc.yml or baselines.yml")
     train.add_argument("--steps", type=int, help="agent steps")
     train.add_argument("--episodes", type=int, default=20, help="unseen episodes at the end (20)")
     train.add_argument("--resume", type=Path, metavar="RUN", help="go on with an interrupted run")
@@ -111,7 +115,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="any argument of TD3BC or of the retrieval wrappers, or env_kwargs.NAME",
+        help="any argument of the algorithm or of the retrieval wrappers, or env_kwargs.NAME",
     )
 
     evaluate = commands.add_parser("evaluate", help="evaluate policy, guided replay and BC")
@@ -296,7 +300,12 @@ def _train(args: argparse.Namespace) -> None:
         if args.resume is not None:
             training.resume(run)
         else:
-            settings = make_settings(args.env, args.preset, args.seed, args.steps, args.set)
+            preset = args.preset or (None if args.algo == "td3bc" else args.algo)
+            settings = make_settings(args.env, preset, args.seed, args.steps, args.set)
+            if args.algo not in (None, settings.algo):
+                raise ValueError(
+                    f"--algo {args.algo}: preset {preset!r} is of {settings.algo}, leave one out"
+                )
             refuse_finished(run)
             demo = args.demo or default_demo(args.env)
             if not demo.exists():

@@ -30,10 +30,12 @@ METHODS = {
     "corrected_guide": "corrected guide",
     "guide": "guided replay",
     "bc": "BC on the demo",
+    "vinn": "VINN-style replay",
 }
 """What ``evaluation.json`` may hold, and what people call it."""
 
-Act = Callable[[Any, VecEnv], npt.NDArray[Any]]
+Act = Callable[[Any, VecEnv, bool], npt.NDArray[Any]]
+"""Observation, environment, and whether an episode begins with it -> action."""
 
 
 @dataclass
@@ -71,11 +73,19 @@ class Evaluation:
 
 
 def policy_act(model: BaseAlgorithm) -> Act:
-    """The deterministic policy."""
-    return lambda obs, env: model.predict(obs, deterministic=True)[0]
+    """The deterministic policy, with what it remembers of an episode."""
+    state: tuple[npt.NDArray[Any], ...] | None = None
+
+    def act(obs: Any, env: VecEnv, first: bool) -> npt.NDArray[Any]:
+        nonlocal state
+        begins = np.full(env.num_envs, first)
+        action, state = model.predict(obs, state, begins, deterministic=True)
+        return action
+
+    return act
 
 
-def guide_act(obs: Any, env: VecEnv) -> npt.NDArray[Any]:
+def guide_act(obs: Any, env: VecEnv, first: bool) -> npt.NDArray[Any]:
     """Guided replay: what ``RetrievalGuideWrapper`` suggests, corrected where it corrects."""
     return np.stack(env.env_method("guide_action"))
 
@@ -90,7 +100,7 @@ def evaluate(
     """Run whole episodes, one after another, episode i reset with seed ``first_seed + i``.
 
     Args:
-        act: observation and environment -> action.
+        act: see ``Act``.
         env: one environment, with the training environment's wrappers.
         episodes: how many.
         first_seed: see above.
@@ -111,7 +121,7 @@ def evaluate(
         while not done:
             if episode == 0:
                 result.first_frames += _frames(obs, env)
-            action = act(obs, env)
+            action = act(obs, env, length == 0)
             if episode == 0 and isinstance(env.action_space, spaces.Box):
                 space = env.action_space  # float32 may put a bound outside by its last bit
                 kept = np.clip(action[0], space.low, space.high).astype(np.float32)

@@ -1,6 +1,7 @@
 """Models as SB3 writes them, opened without running what strangers may have put in.
 
 * ``checked_model`` - a file's bytes, once everything pickled in it is found to be of known kinds
+* ``SafeLoad`` - an algorithm whose ``load`` reads files so
 
 SB3 pickles what JSON cannot hold: spaces, schedules, the policy's class. Unpickling calls what a
 file names: here it may name what a model of this package needs, and call what puts numbers
@@ -18,11 +19,15 @@ import zipfile
 from os import PathLike
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, BinaryIO, ClassVar, TypeVar
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
 
-__all__ = ["checked_model"]
+__all__ = ["SafeLoad", "checked_model"]
+
+SelfSafeLoad = TypeVar("SelfSafeLoad", bound="SafeLoad")
 
 _INFLATED = 4  # times a file's own size: SB3 does not compress
 _SLACK = 1 << 20  # bytes
@@ -58,6 +63,7 @@ _NAMED = {
     "numpy.random._mt19937": {"MT19937"},
     "numpy.random._pcg64": {"PCG64"},
     "numpy.random.bit_generator": {"SeedSequence"},
+    "regil_sb3.baselines.baku": {"BAKUPolicy"},
     "regil_sb3.policies": {"ConvEncoder", "ImagePolicy", "ResNet18Encoder"},
     "regil_sb3.relabelling": {
         "EpisodeRewardDictReplayBuffer",
@@ -116,6 +122,41 @@ def checked_model(path: str | PathLike[str] | BinaryIO) -> BinaryIO:
     except (ValueError, RecursionError, NotImplementedError) as error:
         raise ValueError(f"{name} is not loaded: {error}") from None
     return io.BytesIO(content)
+
+
+class SafeLoad(BaseAlgorithm):
+    """What an algorithm inherits from, before SB3's own class, so that ``load`` runs no code."""
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfSafeLoad],
+        path: str | PathLike[str] | BinaryIO,
+        env: GymEnv | None = None,
+        *args: Any,
+        trust: bool = False,
+        **kwargs: Any,
+    ) -> SelfSafeLoad:
+        """Load a model, as SB3 does; nothing that the file holds is run.
+
+        Args:
+            path: of the file, or the file itself.
+            env: to go on in; None where the model is only to act.
+            *args: SB3's own, in its order: device, custom_objects, print_system_info, force_reset.
+            trust: whether the file may name anything, and so run code: for policies, encoders and
+                schedules of one's own.
+            **kwargs: SB3's own, or attributes to replace, such as ``buffer_size=1`` and ``demo=``.
+
+        Raises:
+            ValueError: the file is no model, is damaged, or names what is not known to be harmless.
+            OSError: it cannot be read.
+        """
+        if trust:
+            return super().load(path, env, *args, **kwargs)  # type: ignore[arg-type]
+        content: Any = checked_model(path)
+        try:
+            return super().load(content, env, *args, **kwargs)
+        except (pickle.UnpicklingError, RuntimeError) as error:
+            raise ValueError(f"{path} does not load: {str(error).splitlines()[0]}") from error
 
 
 def _check_pickle(key: str, text: Any) -> None:

@@ -166,7 +166,23 @@ _ENCODERS: dict[str, type[BaseFeaturesExtractor]] = {
 _OWN = tuple(_ENCODERS.values())
 
 
-def _orthogonal(module: nn.Module) -> None:
+def encoder_class(name: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExtractor]:
+    """The encoder that a name stands for; a class stands for itself.
+
+    Raises:
+        ValueError: no encoder has that name.
+    """
+    if not isinstance(name, str):
+        return name
+    if name not in _ENCODERS:
+        raise ValueError(
+            f"features_extractor_class {name!r} is unknown: "
+            f"use one of {', '.join(sorted(_ENCODERS))}, or a class"
+        )
+    return _ENCODERS[name]
+
+
+def orthogonal(module: nn.Module) -> None:
     """Orthogonal weights, zero biases, as the image-based TD3 of DrQ-v2 starts."""
     if isinstance(module, nn.Linear | nn.Conv2d):
         nn.init.orthogonal_(module.weight)
@@ -220,13 +236,7 @@ class ImagePolicy(TD3Policy):
                 f"CnnPolicy needs image observations (uint8, 0 to 255), not {observation_space}: "
                 "use MlpPolicy or MultiInputPolicy"
             )
-        if isinstance(features_extractor_class, str):
-            if features_extractor_class not in _ENCODERS:
-                raise ValueError(
-                    f"features_extractor_class {features_extractor_class!r} is unknown: "
-                    f"use one of {', '.join(sorted(_ENCODERS))}, or a class"
-                )
-            features_extractor_class = _ENCODERS[features_extractor_class]
+        features_extractor_class = encoder_class(features_extractor_class)
         if optimizer_kwargs is None and "optimizer_class" not in kwargs:
             optimizer_kwargs = {"fused": True}
         self.shared_encoder = shared_encoder
@@ -249,7 +259,7 @@ class ImagePolicy(TD3Policy):
             for name, module in network.named_children():
                 # an extractor class of the user's own may come with weights of its own
                 if name != "features_extractor" or self.features_extractor_class in _OWN:
-                    module.apply(_orthogonal)
+                    module.apply(orthogonal)
         if self.shared_encoder:
             # The critic keeps gradients through the encoder, and its optimizer steps it.
             self.critic.features_extractor = self.actor.features_extractor

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -29,7 +30,7 @@ def refuse_finished(run: Path) -> None:
         )
 
 
-def save_model(model: TD3BC, path: Path) -> None:
+def save_model(model: BaseAlgorithm, path: Path) -> None:
     """Save a model; the old file stays until the new one is complete."""
     with replacing(path) as file:
         model.save(file)

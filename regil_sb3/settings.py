@@ -14,7 +14,10 @@ from typing import Any
 import yaml
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper, make_encoder
 
+from regil_sb3.baselines import BAKU, BC, ROT
 from regil_sb3.td3bc import TD3BC
+
+ALGOS: dict[str, type[TD3BC] | type[BAKU]] = {"td3bc": TD3BC, "bc": BC, "rot": ROT, "baku": BAKU}
 
 RETRIEVAL = {
     "regil_wrappers.RetrievalGuideWrapper": RetrievalGuideWrapper,
@@ -39,6 +42,7 @@ class Settings:
         env: id of the environment.
         env_kwargs: for ``gymnasium.make``.
         env_wrapper: rl-zoo's list, inner first: names, or a name with its arguments.
+        algo: a name of ``ALGOS``.
         preset: section of the YAML this came from.
         seed: of environments, networks and sampling.
         steps: agent steps, all environments together.
@@ -46,10 +50,11 @@ class Settings:
         frame_stack: frames in an observation.
         policy: name of the policy.
         eval_episodes: unseen episodes each time that the policy is evaluated during training.
-        hyperparams: arguments of ``TD3BC``.
+        hyperparams: arguments of the algorithm.
     """
 
     env: str
+    algo: str = "td3bc"
     preset: str = "default"
     seed: int = 0
     steps: int = 15_000
@@ -76,6 +81,7 @@ class Settings:
         """
         try:
             read = yaml.safe_load(path.read_text(encoding="utf-8"))
+            read = {"algo": "td3bc", **read}  # which older runs do not say
             return cls(**{name: read[name] for name in cls.__dataclass_fields__})
         except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
             raise ValueError(
@@ -136,7 +142,16 @@ class Settings:
 
 def presets() -> dict[str, Any]:
     """The sections of ``zoo_configs/td3bc.yml``."""
-    text = (resources.files("regil_sb3.zoo_configs") / "td3bc.yml").read_text(encoding="utf-8")
+    return _zoo_config("td3bc.yml")
+
+
+def comparisons() -> dict[str, Any]:
+    """The sections of ``zoo_configs/baselines.yml``: what each changes of an environment's own."""
+    return _zoo_config("baselines.yml")
+
+
+def _zoo_config(name: str) -> dict[str, Any]:
+    text = (resources.files("regil_sb3.zoo_configs") / name).read_text(encoding="utf-8")
     sections: dict[str, Any] = yaml.safe_load(text)
     return sections
 
@@ -152,29 +167,35 @@ def make_settings(
 
     Args:
         env: id of the environment.
-        preset: a section of the YAML; None takes the environment's own, else "default".
+        preset: a section of ``presets()``, or of ``comparisons()`` on top of the environment's own;
+            None takes the environment's own, else "default".
         seed: see ``Settings``.
         steps: agent steps; None takes the preset's.
-        overrides: "KEY=VALUE" with VALUE as YAML. KEY is an argument of ``TD3BC`` or of the
+        overrides: "KEY=VALUE" with VALUE as YAML. KEY is an argument of the algorithm or of the
             retrieval wrappers, one of the settings above, or ``env_kwargs.NAME``.
 
     Raises:
         ValueError: an unknown preset or key.
     """
-    sections = presets()
-    if preset is None:
-        preset = env if env in sections else "default"
-    if preset not in sections:
-        raise ValueError(f"preset {preset!r} is unknown: use one of {', '.join(sections)}")
-    section = copy.deepcopy(sections[preset])
-    settings = Settings(env=env, preset=preset, seed=seed)
+    sections, compared = presets(), comparisons()
+    own = env if env in sections else "default"
+    preset = preset or own
+    if preset not in sections and preset not in compared:
+        names = ", ".join([*sections, *compared])
+        raise ValueError(f"preset {preset!r} is unknown: use one of {names}")
+    changes = dict(compared.get(preset, {}))
+    section = copy.deepcopy(sections[own if preset in compared else preset])
+    settings = Settings(env, changes.pop("algo", "td3bc"), preset, seed)
+    known = inspect.signature(ALGOS[settings.algo]).parameters
     settings.steps = section.pop("n_timesteps", settings.steps)
     for name in _OWN[1:]:
         if name in section:
             setattr(settings, name, section.pop(name))
     settings.hyperparams = section
     settings.hyperparams.pop("demo", None)  # the run folder's own copy is used
-    for key, value in pairs(overrides or []).items():
+    if settings.algo != "td3bc":  # another algorithm takes what it shares with ours
+        settings.hyperparams = {k: v for k, v in settings.hyperparams.items() if k in known}
+    for key, value in {**changes, **pairs(overrides or [])}.items():
         _override(settings, key, value)
     if steps is not None:
         settings.steps = steps
@@ -182,10 +203,10 @@ def make_settings(
         value = getattr(settings, name)
         if type(value) is not int or value < 1:
             raise ValueError(f"{name} is {value!r}: it must be a whole number of at least 1")
-    known = inspect.signature(TD3BC).parameters
     for name in settings.hyperparams:
         if name not in known:
-            raise ValueError(f"preset {preset!r}: {name!r} is no argument of TD3BC")
+            what = ALGOS[settings.algo].__name__
+            raise ValueError(f"preset {preset!r}: {name!r} is no argument of {what}")
     return settings
 
 
@@ -225,7 +246,7 @@ def encoder_size(settings: Settings) -> int | None:
 
 
 def _override(settings: Settings, key: str, value: Any) -> None:
-    model = set(inspect.signature(TD3BC).parameters) - _NOT_SETTABLE
+    model = set(inspect.signature(ALGOS[settings.algo]).parameters) - _NOT_SETTABLE
     wrappers = {n for c in RETRIEVAL.values() for n in inspect.signature(c).parameters}
     wrappers -= {"env", "demo"}
     own = set(_OWN[:5])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from os import PathLike
-from pickle import UnpicklingError
-from typing import Any, BinaryIO, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -35,7 +34,7 @@ from regil_sb3.arguments import check_arguments
 from regil_sb3.as_seen import as_seen
 from regil_sb3.bc_schedule import BySuccess, by_time
 from regil_sb3.collection import Collection
-from regil_sb3.model_file import checked_model
+from regil_sb3.model_file import SafeLoad
 from regil_sb3.policies import ImagePolicy
 from regil_sb3.relabelling import EpisodeRewards, episode_reward_class, rewards_come_late
 from regil_sb3.replay_buffer import FrameReplayBuffer
@@ -47,7 +46,7 @@ SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
 _AVERAGED = 10  # of the first BC updates: the average takes in about a tenth of those done
 
 
-class TD3BC(TD3):
+class TD3BC(SafeLoad, TD3):
     """TD3 that starts from one demonstration.
 
     The guide (``regil_wrappers.RetrievalGuideWrapper``) acts for the first ``warmup_steps``;
@@ -503,17 +502,23 @@ class TD3BC(TD3):
             return images.div_(255) if self.policy.normalize_images else images
         return preprocess_obs(observations, self.observation_space, self.policy.normalize_images)
 
-    def pretrain_bc(self, steps: int, progress: Callable[[int], None] | None = None) -> None:
+    def pretrain_bc(
+        self, steps: int, progress: Callable[[int], None] | None = None, before: int = 0
+    ) -> float:
         """Train the actor by the BC term alone; its target averages over the last updates.
 
         Args:
             steps: updates.
             progress: called with the number of updates done after each.
+            before: updates that were done in earlier calls, which this one goes on from.
+
+        Returns:
+            The last update's loss; nan without any.
         """
         if steps < 1:
-            return
+            return np.nan
         self.policy.set_training_mode(True)
-        for done in range(1, steps + 1):
+        for done in range(before + 1, before + steps + 1):
             loss = self._bc_term()
             self._require_finite("BC loss", loss.item())
             self.actor.optimizer.zero_grad()
@@ -524,6 +529,7 @@ class TD3BC(TD3):
             if progress is not None:
                 progress(done)
         self.logger.record("train/bc_loss", loss.item())
+        return loss.item()
 
     def _require_finite(self, name: str, value: float) -> None:
         if not np.isfinite(value):
@@ -603,6 +609,7 @@ class TD3BC(TD3):
             # Delayed actor, Eq. 4
             if self._n_updates % self.policy_delay == 0 and trains_actor:
                 actor_loss = th.zeros((), device=self.device)
+                self._before_actor(observations, features.detach())
                 q_coef = self.q_coef_now()
                 if q_coef > 0:
                     # Critic and BC term alone train an image policy's encoders; another policy's
@@ -651,6 +658,9 @@ class TD3BC(TD3):
             self.logger.record("train/critic_loss", np.mean(critic_losses))
             self.logger.record("train/q", current_q_values[0].mean().item())
 
+    def _before_actor(self, observations: Any, features: th.Tensor) -> None:
+        """See an actor update's batch, preprocessed, and the critic's features (B, F) of it."""
+
     def _actor_q(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         if self.actor_q == "q1":
             q: th.Tensor = self.critic.q_networks[0](th.cat([features, actions], dim=1))
@@ -675,37 +685,6 @@ class TD3BC(TD3):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-
-    @classmethod
-    def load(  # type: ignore[override]
-        cls: type[SelfTD3BC],
-        path: str | PathLike[str] | BinaryIO,
-        env: GymEnv | None = None,
-        *args: Any,
-        trust: bool = False,
-        **kwargs: Any,
-    ) -> SelfTD3BC:
-        """Load a model, as SB3 does; nothing that the file holds is run.
-
-        Args:
-            path: of the file, or the file itself.
-            env: to go on in; None where the model is only to act.
-            *args: SB3's own, in its order: device, custom_objects, print_system_info, force_reset.
-            trust: whether the file may name anything, and so run code: for policies, encoders and
-                schedules of one's own.
-            **kwargs: SB3's own, or attributes to replace, such as ``buffer_size=1`` and ``demo=``.
-
-        Raises:
-            ValueError: the file is no model, is damaged, or names what is not known to be harmless.
-            OSError: it cannot be read.
-        """
-        if trust:
-            return super().load(path, env, *args, **kwargs)  # type: ignore[arg-type]
-        content: Any = checked_model(path)
-        try:
-            return super().load(content, env, *args, **kwargs)
-        except (UnpicklingError, RuntimeError) as error:
-            raise ValueError(f"{path} does not load: {str(error).splitlines()[0]}") from error
 
     def _excluded_save_params(self) -> list[str]:
         return [

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 from tqdm import tqdm
 
+from regil_sb3.baselines import BAKU, BC, Offline, vinn_act
 from regil_sb3.evaluation import (
     EVALUATION_SEED,
     SELECTION_SEED,
@@ -43,11 +45,13 @@ from regil_sb3.run_folder import (
     save_calibration,
     save_model,
 )
-from regil_sb3.settings import Settings
+from regil_sb3.settings import ALGOS, Settings
 from regil_sb3.success_films import save_films
 from regil_sb3.td3bc import TD3BC
 
-METHODS = ("policy", "best_policy", "guide", "corrected_guide", "bc")  # that are evaluated
+Learner = TD3BC | BAKU
+
+METHODS = ("policy", "best_policy", "guide", "corrected_guide", "bc", "vinn")  # evaluated
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
 
 
@@ -112,37 +116,38 @@ class TrainingCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._next = (self.num_timesteps // self.every + 1) * self.every
         self._first = self.best < 0
-        self._bar.reset(self._td3bc._total_timesteps)
+        self._bar.reset(self._learner._total_timesteps)
         self._bar.initial = self._bar.n = self.num_timesteps
 
     @property
-    def _td3bc(self) -> TD3BC:
-        assert isinstance(self.model, TD3BC)
+    def _learner(self) -> Learner:
+        assert isinstance(self.model, TD3BC | BAKU)
         return self.model
 
     def _on_rollout_start(self) -> None:
-        if self._first and self._td3bc.pretrained:
+        if self._first and getattr(self.model, "pretrained", False):
             save_calibration(self.training_env, self.run / "calibration.json")
             self._evaluate()
             self._first = False
 
     def _on_step(self) -> bool:
-        model = self._td3bc
+        model = self._learner
         self._bar.update(self.num_timesteps - self._bar.n)
-        if self._bar.n % 50 < model.n_envs:
-            self._describe()
-        self.logger.record("time/frames", self.num_timesteps * self._repeat)
+        online = model if isinstance(model, TD3BC) and not isinstance(model, Offline) else None
+        if online is not None:
+            if self._bar.n % 50 < model.n_envs:
+                self._describe(online)
+            self.logger.record("time/frames", self.num_timesteps * self._repeat)
         if self.num_timesteps >= self._next:
             save_calibration(self.training_env, self.run / "calibration.json")
-            if not model.in_warmup:
+            if online is None or not online.in_warmup:
                 self._evaluate()
             else:
                 save_model(model, self.run / "model.zip")
             self._next += self.every
         return True
 
-    def _describe(self) -> None:
-        model = self._td3bc
+    def _describe(self, model: TD3BC) -> None:
         recent = model.ep_success_buffer
         success = f"{np.mean(recent):.2f}" if recent else "-"
         phase = "guide acts" if model.in_warmup else "policy acts"
@@ -158,11 +163,11 @@ class TrainingCallback(BaseCallback):
         success = float(np.mean(result.successes))
         self.logger.record("eval/success_rate", success)
         self.logger.record("eval/retrieval_reward", float(np.mean(result.returns)))
-        self._td3bc.dump_logs()
-        save_model(self._td3bc, self.run / "model.zip")
+        self._learner.dump_logs()
+        save_model(self._learner, self.run / "model.zip")
         if success > self.best:
             self.best = success
-            save_model(self._td3bc, self.run / "best_model.zip")
+            save_model(self._learner, self.run / "best_model.zip")
 
     def _on_training_end(self) -> None:
         self.close()
@@ -197,7 +202,7 @@ def train(settings: Settings, demo: Demonstration, run: Path) -> None:
     demo.save(run / "demo.hdf5")
     with _environments(settings, run / "demo.hdf5") as (env, eval_env):
         model = _new_model(settings, demo, env)
-        if settings.steps <= model.warmup_steps:
+        if isinstance(model, TD3BC) and settings.steps <= model.warmup_steps:
             raise ValueError(
                 f"{settings.steps} steps end before the warm-up of {model.warmup_steps} does: take "
                 "more --steps, or a smaller --set warmup_steps=N"
@@ -220,20 +225,25 @@ def resume(run: Path) -> Settings:
         ValueError: no run, or one that has ended already.
     """
     settings = Settings.load(run / "config.yaml")
+    algorithm = ALGOS[settings.algo]
+    if issubclass(algorithm, Offline):
+        raise ValueError(f"{run} is of {settings.algo}, which learns in one go: start a new run")
     if not (run / "buffers.npz").exists():
         raise ValueError(
             f"{run} was not interrupted by Ctrl-C, so it has no replay buffer to go on with: "
             "start a new run, or use `regil evaluate` on this one"
         )
     with _environments(settings, run / "demo.hdf5") as (env, eval_env):
-        model = TD3BC.load(run / "model.zip", env=env, demo=Demonstration.load(run / "demo.hdf5"))
+        model = algorithm.load(
+            run / "model.zip", env=env, demo=Demonstration.load(run / "demo.hdf5")
+        )
         load_buffers(model, run / "buffers.npz")
         load_calibration(env, run / "calibration.json")
         _learn(model, settings, run, eval_env)
     return settings
 
 
-def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> None:
+def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> None:
     every = max(settings.steps // 6, 1)
     # The callback reads the log before it is reopened
     callback = TrainingCallback(run, eval_env, every, settings.eval_episodes)
@@ -244,7 +254,8 @@ def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> Non
         model.learn(settings.steps - model.num_timesteps, callback, reset_num_timesteps=fresh)
     except KeyboardInterrupt:
         save_model(model, run / "model.zip")
-        save_buffers(model, run / "buffers.npz")
+        if not isinstance(model, Offline):
+            save_buffers(model, run / "buffers.npz")
         assert model.env is not None
         save_calibration(model.env, run / "calibration.json")
         raise
@@ -257,33 +268,41 @@ def _learn(model: TD3BC, settings: Settings, run: Path, eval_env: VecEnv) -> Non
         model.logger.close()
 
 
-def _new_model(settings: Settings, demo: Demonstration, env: VecEnv, **changes: Any) -> TD3BC:
-    hyperparams = {**settings.hyperparams, **changes}
+def _new_model(settings: Settings, demo: Demonstration, env: VecEnv) -> Learner:
+    algorithm: Any = ALGOS[settings.algo]
     try:
-        return TD3BC(settings.policy, env, demo=demo, seed=settings.seed, **hyperparams)
+        model: Learner = algorithm(
+            settings.policy, env, demo=demo, seed=settings.seed, **settings.hyperparams
+        )
     except TypeError as error:  # an argument of the policy's that does not exist
-        raise ValueError(f"the settings do not fit TD3BC or its policy: {error}") from error
+        name = algorithm.__name__
+        raise ValueError(f"the settings do not fit {name} or its policy: {error}") from error
+    return model
 
 
-def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int) -> TD3BC:
+def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int) -> BC:
     """The "BC" of tables: the run's network, augmentation and batch, on the demonstration alone."""
-    model = _new_model(settings, demo, env, buffer_size=1, warmup_steps=0, bc_coef=1.0)
+    changes = {"buffer_size": 1, "warmup_steps": 0, "bc_coef": 1.0, "q_coef": 0.0}
+    hyperparams = {**settings.hyperparams, **changes}
+    model = _new_model(replace(settings, algo="bc", hyperparams=hyperparams), demo, env)
+    assert isinstance(model, BC)
     model.set_logger(Logger(None, []))
     with tqdm(total=updates, desc="behaviour cloning", unit="update", dynamic_ncols=True) as bar:
 
-        def show(_: int) -> None:
+        def show(*_: Any) -> bool:
             bar.update(1)
+            return True
 
-        model.pretrain_bc(updates, show)
+        model.learn(updates, show)
     return model
 
 
 def _bc_model(
     settings: Settings, demo: Demonstration, env: VecEnv, run: Path, trust: bool
-) -> TD3BC:
+) -> BC:
     """A run's "BC", from its folder or trained now."""
     if (run / "bc_model.zip").exists():
-        return TD3BC.load(run / "bc_model.zip", trust=trust, buffer_size=1)
+        return BC.load(run / "bc_model.zip", trust=trust, buffer_size=1)
     bc = train_bc(settings, demo, env, BC_UPDATES)
     save_model(bc, run / "bc_model.zip")
     return bc
@@ -294,7 +313,8 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Evaluate a run's last and best model, both guides and BC, and write ``evaluation.json``.
 
-    BC is trained here when the folder has no ``bc_model.zip`` yet.
+    BC is trained here when the folder has no ``bc_model.zip`` yet. Beside a model that was cloned
+    from the demonstration alone, VINN-style replay is evaluated instead.
 
     Args:
         run: the folder.
@@ -316,20 +336,24 @@ def evaluate_run(
         closing(make_env(settings, run / "demo.hdf5", n_envs=1)) as env,
         closing(make_env(settings.plain(), run / "demo.hdf5", n_envs=1)) as plain_env,
     ):
-        model = TD3BC.load(run / "model.zip", trust=trust, buffer_size=1)
+        algorithm = ALGOS[settings.algo]
+        model = algorithm.load(run / "model.zip", trust=trust, buffer_size=1)
+        offline = isinstance(model, Offline)
         results: dict[str, Any] = {
             "steps": model.num_timesteps,
-            "frames": model.num_timesteps * action_repeat(env),
+            "frames": 0 if offline else model.num_timesteps * action_repeat(env),
         }
         acts: list[tuple[str, Act, VecEnv]] = [("policy", policy_act(model), env)]
         if (run / "best_model.zip").exists():
-            best = TD3BC.load(run / "best_model.zip", trust=trust, buffer_size=1)
+            best = algorithm.load(run / "best_model.zip", trust=trust, buffer_size=1)
             acts.append(("best_policy", policy_act(best), env))
         if plain_env.has_attr("guide_action"):
             acts.append(("guide", guide_act, plain_env))
         if load_calibration(env, run / "calibration.json"):
             acts.append(("corrected_guide", guide_act, env))
-        if "bc" in only:
+        if offline and "vinn" in only and plain_env.has_attr("retriever"):
+            acts.append(("vinn", vinn_act(demo, settings.retrieval("k")), plain_env))
+        if not offline and "bc" in only:
             acts.append(("bc", policy_act(_bc_model(settings, demo, env, run, trust)), env))
         acts = [act for act in acts if act[0] in only]
         for name, act, where in acts:

@@ -1,0 +1,315 @@
+"""What TD3BC is compared with: each against its paper's equation, and on a task it must solve."""
+
+from __future__ import annotations
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import ot
+import pytest
+import torch as th
+from gymnasium import spaces
+from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper
+from regil_wrappers.transport import band, context_costs, cosine_costs
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from toy import demonstration, stacked
+from toy_env import ToyReach
+
+from regil_sb3.baselines import BAKU, BC, ROT, locally_weighted, vinn_act
+from regil_sb3.baselines.baku import BAKUPolicy
+from regil_sb3.cli import main
+from regil_sb3.evaluation import evaluate, policy_act
+from regil_sb3.settings import ALGOS, Settings, comparisons, make_settings
+from regil_sb3.td3bc import encode
+
+ENV = "regil/metaworld-button-press-v0"
+SMALL = {"chunk": 4, "width": 64, "layers": 1, "dropout": 0.0}
+
+
+class Corner(gym.Env):
+    """A dot that goes right, then down, from one place: who cuts the corner, or misses it, fails.
+
+    Success needs the demonstrator's 16 actions, each nearly right.
+    """
+
+    PATH = tuple([(0.8, 0.0)] * 8 + [(0.0, 0.8)] * 8)
+    observation_space = spaces.Box(0, 255, (40, 40, 3), np.uint8)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def _obs(self):
+        frame = np.zeros((40, 40, 3), np.uint8)
+        x, y = np.clip(self.at, 0, 36).astype(int)
+        frame[y : y + 4, x : x + 4] = 255
+        return frame
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at, self.steps = np.array([4.0, 4.0]), 0
+        return self._obs(), {}
+
+    def step(self, action):
+        self.at = self.at + 4 * np.asarray(action)
+        self.steps += 1
+        x, y = self.at
+        success = bool(abs(x - 29.6) < 3 and abs(y - 29.6) < 3)
+        strayed = not (abs(y - 4) < 3 or abs(x - 29.6) < 3)
+        return (
+            self._obs(),
+            0.0,
+            success,
+            not success and (strayed or self.steps >= 18),
+            {"is_success": success},
+        )
+
+
+@pytest.fixture(scope="module")
+def corner():
+    env = Corner()
+    frames = [env.reset()[0]]
+    frames += [env.step(np.array(a, np.float32))[0] for a in Corner.PATH]
+    demo = Demonstration(np.stack(frames), np.array(Corner.PATH, np.float32))
+    return demo, VecFrameStack(DummyVecEnv([Corner]), 2)
+
+
+def success(model, env) -> float:
+    return float(np.mean(evaluate(policy_act(model), env, 1).successes))
+
+
+@pytest.mark.parametrize("untrained", [True, False])
+def test_bc_overfits_the_demonstration(corner, untrained):
+    demo, env = corner
+    model = BC("CnnPolicy", env, demo=demo, warmup_steps=0, buffer_size=1, seed=0,
+               policy_kwargs={"random_shift": 0})  # fmt: skip
+    if untrained:
+        assert success(model, env) == 0
+        return
+    assert model.learn(250).num_timesteps == 250
+    assert success(model, env) == 1
+    assert model.replay_buffer.size() == 0  # no step was made for it
+
+
+@pytest.mark.parametrize("head", ["mse", "gaussian"])
+def test_baku_overfits_the_demonstration(corner, tmp_path, head):
+    demo, env = corner
+    kwargs = {**SMALL, "head": head, "random_shift": 0, "smoothing": 0.1}
+    model = BAKU("CnnPolicy", env, demo=demo, seed=0, policy_kwargs=kwargs, learning_rate=1e-3,
+                 batch_size=32)  # fmt: skip
+    assert success(model, env) == 0
+    model.learn(200)
+    assert success(model, env) == 1
+    model.save(tmp_path / "model")
+    loaded = BAKU.load(tmp_path / "model")
+    assert loaded.num_timesteps == 200
+    obs = env.reset()
+    for ours, theirs in zip(model.predict(obs, deterministic=True),
+                            loaded.predict(obs, deterministic=True), strict=True):  # fmt: skip
+        np.testing.assert_array_equal(ours, theirs)
+    resumed = BAKU.load(tmp_path / "model", env=env, demo=demo)
+    resumed.learn(5, reset_num_timesteps=False)
+    assert resumed.num_timesteps == 205
+
+
+def test_baku_averages_what_it_said_of_a_step():
+    """Against temporal ensembling as it is defined: w_i = exp(-m i), the oldest first."""
+    n, chunk, m = 2, 3, 0.5
+    space = spaces.Box(np.float32([-1, 0]), np.float32([1, 4]))
+    pictures = spaces.Box(0, 255, (3, 40, 40), np.uint8)
+    kwargs = {**SMALL, "chunk": chunk, "smoothing": m}
+    policy = BAKUPolicy(pictures, space, lambda _: 1e-3, **kwargs)
+    rng = np.random.default_rng(0)
+    said = rng.uniform(-1, 1, (6, n, chunk, 2)).astype(np.float32)
+    begins = np.array([[1, 1], [0, 0], [0, 0], [0, 1], [0, 0], [0, 0]], bool)
+    state = None
+    since = [0, 0]
+    for t in range(len(said)):
+        policy._chunks = lambda *_, t=t: th.as_tensor(said[t])
+        obs = np.zeros((n, 3, 40, 40), np.uint8)
+        action, state = policy.predict(obs, state, begins[t])
+        for env in range(n):
+            since[env] = t if begins[t, env] else since[env]
+            told = [said[b, env, t - b] for b in range(max(since[env], t - chunk + 1), t + 1)]
+            weights = np.exp(-m * np.arange(len(told)))
+            mean = (weights[:, None] * told).sum(axis=0) / weights.sum()
+            np.testing.assert_allclose(action[env], [mean[0], 2 * (mean[1] + 1)], rtol=1e-5)
+
+
+def test_baku_sees_chunks_and_repeats_the_last_action(corner):
+    demo, env = corner
+    model = BAKU("CnnPolicy", env, demo=demo, policy_kwargs=SMALL)
+    path = np.array([*Corner.PATH, *[Corner.PATH[-1]] * 3], np.float32)
+    for t in range(16):
+        np.testing.assert_allclose(model._chunks[t], path[t : t + 4])
+
+
+def test_parameter_counts_are_those_of_the_docstring():
+    space = spaces.Box(0, 255, (6, 84, 84), np.uint8)
+    policy = BAKUPolicy(space, spaces.Box(-1, 1, (4,)), lambda _: 1e-3)
+    count = sum(p.numel() for p in policy.parameters())
+    assert f"{count:,}" in BAKU.__doc__
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [({"head": "gmm"}, "head is 'gmm'"), ({"width": 30}, "multiple of heads=4"),
+     ({"chunk": 0}, "chunk is 0"), ({"features_extractor_class": "vit"}, "'vit' is unknown")],
+)  # fmt: skip
+def test_baku_refuses(corner, change, said):
+    demo, env = corner
+    with pytest.raises(ValueError, match=said):
+        BAKU("CnnPolicy", env, demo=demo, policy_kwargs=change)
+    with pytest.raises(ValueError, match="needs demo="):
+        BAKU("CnnPolicy", env)
+
+
+def rot(**kwargs):
+    settings = {"warmup_steps": 0, "buffer_size": 200, "batch_size": 8, "learning_starts": 0,
+                "bc_pretrain_steps": 3, "seed": 0, **kwargs}  # fmt: skip
+    return ROT("CnnPolicy", stacked(), demo=demonstration(), **settings)
+
+
+class Says(th.nn.Module):
+    """A network whose answer is known."""
+
+    def __init__(self, answer):
+        super().__init__()
+        self.answer = answer
+
+    def forward(self, inputs):
+        return self.answer(inputs) if callable(self.answer) else th.tensor(self.answer)
+
+
+def test_rots_weight_on_a_batch_made_by_hand():
+    model = rot(bc_coef=3.0)
+    # Q(o, a) = a[0]; the first critic says more, and the smaller of both counts
+    model.critic.q_networks = [Says(lambda x: x[:, -2:-1] + 1), Says(lambda x: x[:, -2:-1])]
+    model.bc_actor.mu = Says([[0.5, 0.0], [-0.5, 0.9], [0.1, 0.9], [0.0, 0.0]])
+    model.actor.mu = Says([[0.2, 0.9], [-0.2, 0.0], [0.1, 0.0], [0.3, 0.0]])
+    images = th.zeros(4, *model.observation_space.shape)
+    model._before_actor(images, th.zeros(4, 7))
+    assert model.soft_q == 0.25  # better by cloning, worse, as good (which is not better), worse
+    assert model.bc_coef_now() == 3.0 * 0.25
+    assert model.q_coef_now() == 0.75
+
+
+def test_rot_learns_with_that_weight_and_keeps_what_it_cloned(tmp_path):
+    model = rot()
+    model.learn(60)
+    assert model._n_updates > 0
+    logged = model.logger.name_to_value
+    assert logged["train/bc_coef"] == pytest.approx(model.bc_coef * model.soft_q)
+    assert logged["train/q_coef"] == pytest.approx(1 - model.soft_q)
+    model.save(tmp_path / "model")
+    loaded = ROT.load(tmp_path / "model")
+    images = th.rand(3, *model.observation_space.shape, device=model.device)
+    with th.no_grad():
+        before, own, after = (
+            actor.mu(encode(actor, images))
+            for actor in (model.bc_actor, model.actor, loaded.bc_actor)
+        )
+    np.testing.assert_array_equal(before, after)
+    assert not th.equal(before, own)
+
+
+@pytest.mark.parametrize("reward", ["ot", "tot"])
+def test_rewards_of_recorded_episodes_are_pots_transport(demo, reward):
+    """Frames in, rewards out: the whole way of a run, against POT's Sinkhorn."""
+    env = RetrievalRewardWrapper(ToyReach(frozen=False), demo=demo, reward=reward)
+    rng = np.random.default_rng(0)
+    memory = env.retriever.embeddings
+    for seed in range(3):
+        env.reset(seed=seed)
+        seen, over = [env.retriever.embedding], False
+        while not over:
+            *_, terminated, truncated, info = env.step(rng.uniform(-0.3, 1, 2).astype(np.float32))
+            seen.append(env.retriever.embedding)
+            over = terminated or truncated
+        costs = cosine_costs(np.stack(seen), memory)
+        t, n = costs.shape
+        if reward == "tot":
+            costs = context_costs(costs, 3)
+            solved = np.where(band(t, n), costs, 1e9)
+        else:
+            solved = costs
+        plan = ot.sinkhorn(
+            np.full(t, 1 / t), np.full(n, 1 / n), solved, 0.01, method="sinkhorn_log",
+            numItermax=100, stopThr=0, warn=False,
+        )  # fmt: skip
+        expected = -(plan * costs).sum(axis=1)[1:]  # the first frame is no step's outcome
+        np.testing.assert_allclose(info["retrieval"]["episode_rewards"], expected, atol=1e-5)
+
+
+def test_vinns_action_is_locally_weighted_regression():
+    actions = np.array([[1, 0], [0, 1], [0.5, -1]], np.float32)
+    distances = np.array([2.0, 0.5, 1.0, 0.6])  # of four frames: the last one has action 2's
+    weights = np.exp([-0.5, -0.6])
+    expected = (weights[0] * actions[1] + weights[1] * actions[2]) / weights.sum()
+    np.testing.assert_allclose(locally_weighted(distances, actions, 2), expected, rtol=1e-6)
+    np.testing.assert_array_equal(locally_weighted(distances, actions, 1), actions[1])
+    far = locally_weighted(distances + 1e4, actions, 2)  # exp(-1e4) is 0
+    np.testing.assert_allclose(far, expected, rtol=1e-6)
+
+
+def test_vinn_plays_in_an_environment(corner):
+    demo, _ = corner
+    env = DummyVecEnv([lambda: RetrievalGuideWrapper(Corner(), demo=demo, k=1, horizon=2)])
+    assert evaluate(vinn_act(demo, 1), env, 1).successes == [True]
+
+
+@pytest.mark.parametrize("name", comparisons())
+def test_a_comparison_changes_what_it_names_and_no_more(name):
+    for env in (ENV, "regil/libero-kitchen1-drawer-v0"):
+        ours, theirs = make_settings(env), make_settings(env, name)
+        named = comparisons()[name].keys()
+        for key in ("env_kwargs", "frame_stack", "n_envs", "eval_episodes", "policy"):
+            assert getattr(ours, key) == getattr(theirs, key)
+        assert theirs.steps == ours.steps or "n_timesteps" in named
+        for key, value in theirs.hyperparams.items():
+            assert key in named or ours.hyperparams[key] == value, key
+        for (_, a), (_, b) in zip(ours.wrappers("x"), theirs.wrappers("x"), strict=True):
+            assert {k for k in a if a[k] != b[k]} <= named
+        if ALGOS[theirs.algo] is not BAKU:
+            assert theirs.hyperparams["policy_kwargs"] == ours.hyperparams["policy_kwargs"]
+
+
+def test_the_papers_ablations():
+    made = {name: make_settings(ENV, f"ablation-{name}").hyperparams
+            for name in ("bc-rl", "reg-rl", "rl", "reg-bc")}  # fmt: skip
+    without_guide = {n for n, h in made.items() if h["warmup_steps"] == h["guide_again"] == 0}
+    assert without_guide == {"bc-rl", "rl"}
+    assert {n for n, h in made.items() if h.get("bc_coef", 2.0) == 0} == {"reg-rl", "rl"}
+    assert {n for n, h in made.items() if h.get("q_coef", 1.0) == 0} == {"reg-bc"}
+    assert not made["bc-rl"]["keep_own_successes"]  # the demonstration alone
+
+
+def test_algo_and_preset_must_agree(capsys):
+    words = ["train", "--env", ENV, "--preset", "tot", "--algo"]
+    assert main([*words, "baku"]) == 2
+    assert "'tot' is of rot" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("algo", "steps", "changes"),
+    [
+        ("rot", 45, ["bc_pretrain_steps=2", "buffer_size=300", "batch_size=8"]),
+        ("baku", 2, ["policy_kwargs.layers=1", "batch_size=8"]),
+    ],
+)
+def test_trained_and_evaluated_as_td3bc_is(tmp_path, monkeypatch, capsys, algo, steps, changes):
+    monkeypatch.setattr("regil_sb3.training.BC_UPDATES", 2)
+    run = tmp_path / "run"
+    words = ["train", "--algo", algo, "--env", ENV, "--demo", str(tmp_path / "demo.hdf5")]
+    words += ["--steps", str(steps), "--episodes", "1", "--out", str(run)]
+    for change in [*changes, "eval_episodes=1", "env_kwargs.max_steps=20"]:
+        words += ["--set", change]
+    assert main(words) == 0
+    assert Settings.load(run / "config.yaml").algo == algo
+    results = json.loads((run / "evaluation.json").read_text())
+    assert results["steps"] == steps
+    assert results["seeds"] == [1_000_000]
+    offline = algo == "baku"
+    assert results["frames"] == (0 if offline else 2 * steps)
+    assert {"policy", "guide", "vinn" if offline else "bc"} <= results.keys()
+    capsys.readouterr()
+    assert main(["train", "--resume", str(run)]) == 2
+    assert ("learns in one go" in capsys.readouterr().err) == offline
