@@ -1,4 +1,4 @@
-"""What TD3BC's arguments may be."""
+"""What an algorithm's arguments may be."""
 
 from __future__ import annotations
 
@@ -50,15 +50,15 @@ def check_arguments(given: dict[str, Any]) -> None:
         if given[name] not in choices:
             raise ValueError(f"{name} is {given[name]!r}: use one of {', '.join(choices)}")
     for name, (kinds, least, most) in _RANGES.items():
-        _check_number(name, given[name], kinds, least, most)
+        check_number(name, given[name], kinds, least, most)
     if given["reward_scale"] != "auto":
-        _check_number("reward_scale", given["reward_scale"], _NUMBER, 0.0, np.inf)
+        check_number("reward_scale", given["reward_scale"], _NUMBER, 0.0, np.inf)
     if given["bc_steps"] is not None:
-        _check_number("bc_steps", given["bc_steps"], (int,), 1, np.inf)
+        check_number("bc_steps", given["bc_steps"], (int,), 1, np.inf)
     if not callable(given["learning_rate"]):
-        _check_number("learning_rate", given["learning_rate"], _NUMBER, 0.0, np.inf)
+        check_number("learning_rate", given["learning_rate"], _NUMBER, 0.0, np.inf)
     _check_train_freq(given["train_freq"])
-    _check_device(given["device"])
+    check_device(given["device"])
     if given["q_coef"] == 0 and given["bc_coef"] == 0:
         raise ValueError("q_coef=0 and bc_coef=0 leave the actor nothing to learn from")
 
@@ -67,12 +67,13 @@ def _check_train_freq(train_freq: Any) -> None:
     unit = "step"
     if isinstance(train_freq, tuple | list) and len(train_freq) == 2:
         train_freq, unit = train_freq
-    _check_number("train_freq", train_freq, (int,), 1, np.inf)
+    check_number("train_freq", train_freq, (int,), 1, np.inf)
     if unit not in ("step", "episode"):
         raise ValueError(f"train_freq counts in {unit!r}: use 'step' or 'episode'")
 
 
-def _check_device(device: Any) -> None:
+def check_device(device: Any) -> None:
+    """Refuse a device that is not there, in one line."""
     if device == "auto":
         return
     try:
@@ -83,9 +84,7 @@ def _check_device(device: Any) -> None:
         raise ValueError(f"device is {str(device)!r} and no GPU is found: use 'cpu'")
 
 
-def _check_number(
-    name: str, value: Any, kinds: tuple[type, ...], least: float, most: float
-) -> None:
+def check_number(name: str, value: Any, kinds: tuple[type, ...], least: float, most: float) -> None:
     """Refuse what is no number of these kinds within [least, most], in one line."""
     fits = isinstance(value, (*kinds, np.integer)) and not isinstance(value, bool)
     if not fits or not least <= value <= most:

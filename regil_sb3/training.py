@@ -263,7 +263,8 @@ def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> N
         save_model(model, run / "model.zip")
         (run / "buffers.npz").unlink(missing_ok=True)
     finally:
-        save_films(model.success_buffer, run / "success_buffer.npz")
+        if isinstance(model, TD3BC):
+            save_films(model.success_buffer, run / "success_buffer.npz")
         callback.close()
         model.logger.close()
 

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
 from torch import nn
 from torch.nn import functional as F  # noqa: N812
 
+from regil_sb3.arguments import check_device, check_number
 from regil_sb3.as_seen import as_seen
 from regil_sb3.baselines.offline import Offline
 from regil_sb3.model_file import SafeLoad
@@ -83,10 +84,12 @@ class BAKUPolicy(BasePolicy):
         if head not in ("mse", "gaussian"):
             raise ValueError(f"head is {head!r}: use one of mse, gaussian")
         for name, value in (("chunk", chunk), ("layers", layers), ("heads", heads)):
-            if type(value) is not int or value < 1:
-                raise ValueError(f"{name} is {value!r}: it must be a whole number of at least 1")
-        if type(width) is not int or width < 1 or width % heads:
-            raise ValueError(f"width is {width!r}: it must be a multiple of heads={heads}")
+            check_number(name, value, (int,), 1, np.inf)
+        check_number("width", width, (int,), heads, np.inf)
+        check_number("dropout", dropout, (int, float), 0.0, 1.0)
+        check_number("smoothing", smoothing, (int, float), -np.inf, np.inf)
+        if width % heads:
+            raise ValueError(f"width is {width}: it must be a multiple of heads={heads}")
         super().__init__(
             observation_space,
             action_space,
@@ -214,7 +217,7 @@ class BAKU(SafeLoad, Offline):
     It minimises the squared error (or the negative log likelihood) of the next ``chunk`` actions
     over the demonstration's steps; beyond its end its last action goes on. With the encoder "conv"
     at 84x84, two frames stacked and four action dimensions it has 6,887,032 parameters, 6.3 million
-    of them in the trunk; docs/baselines.md has the original's beside them.
+    of them in the trunk.
 
     Paper: Haldar, Peng and Pinto, BAKU: An Efficient Transformer for Multi-Task Policy Learning,
     NeurIPS 2024, https://arxiv.org/abs/2406.07539
@@ -256,8 +259,10 @@ class BAKU(SafeLoad, Offline):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        if type(batch_size) is not int or batch_size < 1:
-            raise ValueError(f"batch_size is {batch_size!r}: it must be at least 1")
+        check_number("batch_size", batch_size, (int,), 1, np.inf)
+        if not callable(learning_rate):
+            check_number("learning_rate", learning_rate, (int, float), 0.0, np.inf)
+        check_device(device)
         super().__init__(
             policy,
             env,

@@ -297,8 +297,9 @@ def test_algo_and_preset_must_agree(capsys):
 )
 def test_trained_and_evaluated_as_td3bc_is(tmp_path, monkeypatch, capsys, algo, steps, changes):
     monkeypatch.setattr("regil_sb3.training.BC_UPDATES", 2)
-    run = tmp_path / "run"
-    words = ["train", "--algo", algo, "--env", ENV, "--demo", str(tmp_path / "demo.hdf5")]
+    run, demo = tmp_path / "run", tmp_path / "demo.hdf5"
+    assert main(["record", ENV, "-o", str(demo)]) == 0
+    words = ["train", "--algo", algo, "--env", ENV, "--demo", str(demo)]
     words += ["--steps", str(steps), "--episodes", "1", "--out", str(run)]
     for change in [*changes, "eval_episodes=1", "env_kwargs.max_steps=20"]:
         words += ["--set", change]
