@@ -147,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument(
         "table",
         help="rendering, retrieval, ranking, guide, success-buffer, latency, memory, index, "
-        "throughput; ablations, rewards (training runs)",
+        "throughput; baselines, ablations, rewards (training runs)",
     )
     bench.add_argument(
         "--tasks",

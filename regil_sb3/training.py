@@ -226,9 +226,8 @@ def resume(run: Path) -> Settings:
     """
     settings = Settings.load(run / "config.yaml")
     algorithm = ALGOS[settings.algo]
-    if issubclass(algorithm, Offline):
-        raise ValueError(f"{run} is of {settings.algo}, which learns in one go: start a new run")
-    if not (run / "buffers.npz").exists():
+    offline = issubclass(algorithm, Offline)
+    if not offline and not (run / "buffers.npz").exists():
         raise ValueError(
             f"{run} was not interrupted by Ctrl-C, so it has no replay buffer to go on with: "
             "start a new run, or use `regil evaluate` on this one"
@@ -237,7 +236,10 @@ def resume(run: Path) -> Settings:
         model = algorithm.load(
             run / "model.zip", env=env, demo=Demonstration.load(run / "demo.hdf5")
         )
-        load_buffers(model, run / "buffers.npz")
+        if model.num_timesteps >= settings.steps:
+            raise ValueError(f"{run} has made its {settings.steps} steps: use `regil evaluate`")
+        if isinstance(model, TD3BC) and not offline:
+            load_buffers(model, run / "buffers.npz")
         load_calibration(env, run / "calibration.json")
         _learn(model, settings, run, eval_env)
     return settings
@@ -298,9 +300,7 @@ def train_bc(settings: Settings, demo: Demonstration, env: VecEnv, updates: int)
     return model
 
 
-def _bc_model(
-    settings: Settings, demo: Demonstration, env: VecEnv, run: Path, trust: bool
-) -> BC:
+def _bc_model(settings: Settings, demo: Demonstration, env: VecEnv, run: Path, trust: bool) -> BC:
     """A run's "BC", from its folder or trained now."""
     if (run / "bc_model.zip").exists():
         return BC.load(run / "bc_model.zip", trust=trust, buffer_size=1)
