@@ -181,9 +181,9 @@ def _usual(setting: Setting, own: tuple[Any, ...]) -> tuple[bool, ...]:
 
 
 def _line(s: Setting) -> str:
-    failure = "" if np.isnan(s.reward.above_failure) else f"{s.reward.above_failure:.0%} and "
+    failure = "" if np.isnan(s.reward.above_failure) else f"failure {s.reward.above_failure:.0%}, "
     line = (
-        f"k {s.k}, horizon {s.horizon}: success above failure and standing still in {failure}"
+        f"k {s.k}, horizon {s.horizon}: success above {failure}standing still "
         f"{s.reward.above_still:.0%}, order {s.reward.order:+.2f}, freezing beats finishing in "
         f"{s.reward.freezing:.0%}, {s.milliseconds:.1f} ms a picture"
     )
