@@ -689,6 +689,8 @@ class TD3BC(SafeLoad, TD3):
     def _excluded_save_params(self) -> list[str]:
         return [
             *super()._excluded_save_params(),
+            "_last_obs",  # load() resets the environment
+            "_last_original_obs",
             "demo",
             "success_buffer",
             "_in_step",
