@@ -10,16 +10,24 @@ from typing import TYPE_CHECKING, Any
 import regil_sb3.envs  # noqa: F401  registers regil/...
 
 if TYPE_CHECKING:
+    from regil_sb3.guided import GuidedWarmup as GuidedWarmup
     from regil_sb3.success_buffer import SuccessBuffer as SuccessBuffer
     from regil_sb3.td3bc import TD3BC as TD3BC
     from regil_sb3.vec_env import VecRetrievalGuide as VecRetrievalGuide
     from regil_sb3.vec_env import VecRetrievalReward as VecRetrievalReward
 
 __version__ = "0.1.0"
-__all__ = ["TD3BC", "SuccessBuffer", "VecRetrievalGuide", "VecRetrievalReward"]
+__all__ = [
+    "TD3BC",
+    "GuidedWarmup",
+    "SuccessBuffer",
+    "VecRetrievalGuide",
+    "VecRetrievalReward",
+]
 
 _HOME = {
     "TD3BC": "regil_sb3.td3bc",
+    "GuidedWarmup": "regil_sb3.guided",
     "SuccessBuffer": "regil_sb3.success_buffer",
     "VecRetrievalGuide": "regil_sb3.vec_env",
     "VecRetrievalReward": "regil_sb3.vec_env",

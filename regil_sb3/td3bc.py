@@ -34,6 +34,7 @@ from regil_sb3.arguments import check_arguments
 from regil_sb3.as_seen import as_seen
 from regil_sb3.bc_schedule import BySuccess, by_time
 from regil_sb3.collection import Collection
+from regil_sb3.guided import guide_actions
 from regil_sb3.model_file import SafeLoad
 from regil_sb3.policies import ImagePolicy
 from regil_sb3.relabelling import EpisodeRewards, episode_reward_class, rewards_come_late
@@ -379,21 +380,14 @@ class TD3BC(SafeLoad, TD3):
                 action = action.clip(self.action_space.low, self.action_space.high)
         if guided.any():
             indices = np.flatnonzero(guided)
-            suggested = self._guide_actions("guide_action", indices)
+            suggested = guide_actions(self.env, indices)
             self._collection.note_guide(indices, self.policy.scale_action(suggested))
             if self.env.has_attr("disturbed_action"):
-                suggested = self._guide_actions("disturbed_action", indices)
+                suggested = guide_actions(self.env, indices, "disturbed_action")
             action[indices] = suggested
             buffer_action[indices] = self.policy.scale_action(suggested)
         self._in_step = True
         return action, buffer_action
-
-    def _guide_actions(self, name: str, indices: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """What the guides of these environments say, (n, A), clipped to the action space."""
-        assert self.env is not None
-        assert isinstance(self.action_space, spaces.Box)
-        said = np.stack(self.env.env_method(name, indices=indices.tolist()))
-        return said.clip(self.action_space.low, self.action_space.high, out=said)
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: npt.NDArray[Any] | None = None

@@ -78,6 +78,9 @@ REHEARSAL_TASKS = ("reach", "insert", "open")
 def register_envs() -> None:
     """Register `regil/metaworld-<task>-v0`, `regil/libero-...` and `regil/rehearsal-...`.
 
+    `regil/metaworld-<task>-state-v0` is the first with `obs="state", render_mode="rgb_array"`: for
+    policies that see no picture, and rewards that do (`image="render"`).
+
     The time limit is not Gymnasium's: it sits inside the environment (`max_steps`), where it
     counts agent steps under the action repeat and truncates.
     """
@@ -93,6 +96,11 @@ def register_envs() -> None:
             env_id = f"regil/{simulator}-{task}-v0"
             if env_id not in registry:  # calling it twice is harmless and warns of nothing
                 register(env_id, entry_point=entry_point, kwargs={"task": task})
+    for task in METAWORLD_TASKS:
+        env_id = f"regil/metaworld-{task}-state-v0"
+        if env_id not in registry:
+            seen = {"obs": "state", "render_mode": "rgb_array"}
+            register(env_id, entry_point=simulators["metaworld"][0], kwargs={"task": task, **seen})
 
 
 register_envs()
