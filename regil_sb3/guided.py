@@ -94,8 +94,9 @@ class GuidedWarmup(BaseCallback):
         self._give_back()  # of a learning that was interrupted
         self._guided = np.full(self.training_env.num_envs, self.num_timesteps < self.steps)
         if self._guided.any():
-            self._own_class = type(self.model)  # type: ignore[assignment]
-            self.model.__class__ = _guided_class(self._own_class, self._play)
+            assert isinstance(self.model, OffPolicyAlgorithm)
+            self._own_class = own = type(self.model)
+            self.model.__class__ = _guided_class(own, self._play)
 
     def _play(self, action: Array, buffer_action: Array) -> tuple[Array, Array]:
         """Put the guides' actions over the policy's, in the environments that they act in."""

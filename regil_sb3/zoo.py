@@ -39,7 +39,15 @@ try:
 except ImportError as error:
     raise ImportError(f"rl_zoo3 is not installed ({error}): pip install 'regil-sb3[zoo]'") from None
 
-__all__ = ["COMMANDS", "Experiment", "GoingOn", "convert_td3bc", "main", "sample_td3bc"]
+__all__ = [
+    "COMMANDS",
+    "EVALUATED",
+    "Experiment",
+    "GoingOn",
+    "convert_td3bc",
+    "main",
+    "sample_td3bc",
+]
 
 COMMANDS = {
     "train": "rl_zoo3.train",
@@ -53,7 +61,7 @@ COMMANDS = {
 """Names of commands, and rl_zoo3's modules that they run."""
 
 # rl_zoo3 evaluates these as Python where they are text
-_EVALUATED = (
+EVALUATED = (
     "normalize",
     "policy_kwargs",
     "replay_buffer_class",
@@ -96,12 +104,12 @@ class _KeepCalibration(BaseCallback):
             save_calibration(self.training_env, self.path)
 
 
-class Experiment(ExperimentManager):  # type: ignore[misc]
+class Experiment(ExperimentManager):
     """rl_zoo3's experiment, with what the module's docstring names."""
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         if self.algo == "td3bc":
-            for name in _EVALUATED:
+            for name in EVALUATED:
                 if isinstance(hyperparams.get(name), str):
                     raise ValueError(
                         f"{name}: {hyperparams[name]!r} would be evaluated as Python: write plain "
@@ -120,7 +128,7 @@ class Experiment(ExperimentManager):  # type: ignore[misc]
 
     def create_callbacks(self) -> None:
         """rl_zoo3's own, after one that it ends even when a run is interrupted."""
-        super().create_callbacks()
+        super().create_callbacks()  # type: ignore[no-untyped-call]
         if self.algo == "td3bc":
             self.callbacks.insert(0, _KeepCalibration(Path(self.save_path) / "calibration.json"))
 
@@ -188,9 +196,9 @@ def sample_td3bc(
     return converted
 
 
-def convert_td3bc(sampled: dict[str, Any]) -> dict[str, Any]:
+def convert_td3bc(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """TD3BC's arguments from what `sample_td3bc` suggests to Optuna."""
-    out = dict(sampled)
+    out = dict(sampled_params)
     out["batch_size"] = 2 ** out.pop("batch_size_pow")
     out["gamma"] = 1.0 - out.pop("one_minus_gamma")
     return out

@@ -157,7 +157,7 @@ def test_evaluation_seeds_give_the_same_frames_to_every_method(demo):
 def test_presets_are_plain_yaml_and_fit():
     sections = presets()
     assert {"default", "quick", "paper"} <= sections.keys()
-    assert sum(name.startswith("regil/metaworld-") for name in sections) == 7
+    assert sum(name.startswith("regil/metaworld-") for name in sections) == 8
     for name, section in sections.items():
         settings = make_settings(ENV, name)
         assert settings.steps == section["n_timesteps"]
