@@ -13,9 +13,11 @@ from typing import Any
 
 import yaml
 
+from regil_sb3.baselines import Offline
 from regil_sb3.evaluation import METHODS
 from regil_sb3.files import replacing
-from regil_sb3.settings import Settings
+from regil_sb3.settings import ALGOS, Settings
+from regil_sb3.td3bc import TD3BC
 
 __all__ = ["SHARED", "push", "write_card"]
 
@@ -29,10 +31,9 @@ _CARD = """\
 ---
 {front}---
 
-# TD3BC on `{env}`
+# {algorithm} on `{env}`
 
-A policy that ReGIL learned from one demonstration: guided warm-up, behaviour cloning on what
-succeeded, and TD3, in {steps:,} agent steps ({frames:,} frames).
+A policy that was learned from one demonstration: {how}, in {steps:,} {unit} ({frames:,} frames).
 
 | {episodes} unseen episodes, seeds from {first_seed} on | success |
 |---|---|
@@ -48,18 +49,25 @@ nothing here limits what the policy does to a robot.
 from pathlib import Path
 
 from huggingface_hub import snapshot_download
-from regil_sb3 import TD3BC
+from regil_sb3{home} import {algorithm}
 from regil_sb3.settings import Settings
 from regil_sb3.training import make_env
 
 run = Path(snapshot_download("{repo}"))
 env = make_env(Settings.load(run / "config.yaml"), run / "demo.hdf5", n_envs=1)
-model = TD3BC.load(run / "model.zip", buffer_size=1)
+model = {algorithm}.load(run / "model.zip", buffer_size=1)
 action, _ = model.predict(env.reset(), deterministic=True)
 ```
 
 Or evaluate it again: `hf download {repo} --local-dir RUN`, then `regil evaluate RUN`.
 """
+
+_HOW = {
+    "td3bc": "ReGIL's guided warm-up, behaviour cloning on what succeeded, and TD3",
+    "bc": "behaviour cloning",
+    "baku": "cloning of chunks of its actions",
+    "rot": "behaviour cloning, and RL on transport rewards",
+}
 
 
 def write_card(run: Path, repo: str = "OWNER/NAME") -> Path:
@@ -80,6 +88,7 @@ def write_card(run: Path, repo: str = "OWNER/NAME") -> Path:
         results: dict[str, Any] = json.loads((run / "evaluation.json").read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise ValueError(f"{run} has no evaluation ({error}): regil evaluate {run}") from error
+    algorithm = ALGOS[settings.algo]
     found = {name: results[name] for name in METHODS if name in results}
     episodes = results["policy"]["episodes"]
     task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
@@ -98,11 +107,11 @@ def write_card(run: Path, repo: str = "OWNER/NAME") -> Path:
         "pipeline_tag": "reinforcement-learning",
         "tags": [
             *("reinforcement-learning", "deep-reinforcement-learning", "imitation-learning"),
-            *("robotics", "stable-baselines3", "regil", "td3bc", settings.env),
+            *("robotics", "stable-baselines3", "regil", settings.algo, settings.env),
         ],
         "model-index": [
             {
-                "name": "TD3BC",
+                "name": algorithm.__name__,
                 "results": [
                     {
                         "task": task,
@@ -114,6 +123,10 @@ def write_card(run: Path, repo: str = "OWNER/NAME") -> Path:
         ],
     }
     card = _CARD.format(
+        algorithm=algorithm.__name__,
+        home="" if algorithm is TD3BC else ".baselines",
+        how=_HOW[settings.algo],
+        unit="updates" if issubclass(algorithm, Offline) else "agent steps",
         front=yaml.safe_dump(front, sort_keys=False),
         env=settings.env,
         steps=results["steps"],

@@ -309,6 +309,9 @@ def test_trained_and_evaluated_as_td3bc_is(tmp_path, monkeypatch, capsys, algo, 
     results = json.loads((run / "evaluation.json").read_text())
     assert results["steps"] == steps
     assert results["seeds"] == [1_000_000]
+    card = (run / "README.md").read_text()
+    assert f"# {ALGOS[algo].__name__} on `{ENV}`" in card
+    assert f"from regil_sb3.baselines import {ALGOS[algo].__name__}\n" in card
     offline = algo == "baku"
     assert results["frames"] == (0 if offline else 2 * steps)
     assert {"policy", "guide", "vinn" if offline else "bc"} <= results.keys()
