@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import Any
 
 import numpy as np
 
@@ -66,3 +67,14 @@ class BySuccess:
         if successes == 0:
             return False
         return len(self.recent) < FEW or bool(np.mean(self.recent) < successes / episodes)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that has been seen, as plain values."""
+        recent, guide = list(self.recent), list(self.guide)
+        return {"share": self.share, "best": self.best, "recent": recent, "guide": guide}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what ``state`` returned."""
+        self.share, self.best = state["share"], state["best"]
+        self.recent = deque(state["recent"], maxlen=RECENT)
+        self.guide = list(state["guide"])

@@ -284,7 +284,8 @@ def _train(args: argparse.Namespace) -> None:
     from regil_wrappers import Demonstration
 
     from regil_sb3 import process, training
-    from regil_sb3.run_folder import refuse_finished
+    from regil_sb3.checkpoint import Preempted
+    from regil_sb3.run_folder import checkpoints_of, refuse_finished
     from regil_sb3.settings import encoder_size, make_settings
 
     process.keep_freed_memory()
@@ -318,8 +319,8 @@ def _train(args: argparse.Namespace) -> None:
                         "or name yours with --demo"
                     ) from error
             training.train(settings, Demonstration.load(demo), run)
-    except KeyboardInterrupt:
-        if (run / "buffers.npz").exists():
+    except (KeyboardInterrupt, Preempted):
+        if checkpoints_of(run).exists():
             print(f"\nsaved; go on with: regil train --resume {run}", file=sys.stderr)
         elif (run / "model.zip").exists():
             print(f"\nthe model is in {run}: regil evaluate {run}", file=sys.stderr)
@@ -381,6 +382,8 @@ def _doctor(args: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command; 0 when it worked, 2 for bad input (one line says what), 130 for Ctrl-C.
+
+    75, "try again", where `train` was told to end (SIGTERM) and can go on with --resume.
 
     `doctor` also has 1: something is wrong with the demonstration.
     """

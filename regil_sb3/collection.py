@@ -10,6 +10,7 @@ import numpy.typing as npt
 from regil_sb3.success_buffer import Observations
 
 _REWARDS = ("env_reward", "retrieval_reward")
+_STATE = ("guided", "warmup", "lengths", "succeeded", "_demonstrates", "_labels")
 
 
 class Collection:
@@ -106,6 +107,9 @@ class Collection:
         """
         if self.calibrating(env) or not (self.succeeded[env] and self._steps[env]):
             return None
+        return self._kept(env)
+
+    def _kept(self, env: int) -> tuple[Observations, npt.NDArray[np.float32]]:
         seen, actions = zip(*self._steps[env], strict=True)
         observations: Observations = (
             {k: np.stack([o[k] for o in seen]) for k in seen[0]}
@@ -113,3 +117,31 @@ class Collection:
             else np.stack(seen)
         )
         return observations, np.stack(actions)
+
+    def state(self) -> dict[str, Any]:
+        """The open episodes as plain arrays."""
+        kept = [self._kept(i) if steps else None for i, steps in enumerate(self._steps)]
+        return {
+            **{name: getattr(self, name) for name in _STATE},
+            "returns": self._returns,
+            "steps": kept,
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Take over what ``state`` returned."""
+        for name in _STATE:
+            setattr(self, name, state[name])
+        self._returns = state["returns"]
+        self._steps = [[] if kept is None else _taken_apart(*kept) for kept in state["steps"]]
+
+
+def _taken_apart(
+    observations: Observations, actions: npt.NDArray[np.float32]
+) -> list[tuple[Any, npt.NDArray[Any]]]:
+    if isinstance(observations, dict):
+        seen: list[Any] = [
+            {key: values[i] for key, values in observations.items()} for i in range(len(actions))
+        ]
+    else:
+        seen = list(observations)
+    return list(zip(seen, actions, strict=True))

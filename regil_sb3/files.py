@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from io import BufferedWriter
 from pathlib import Path
 
-__all__ = ["replacing"]
+__all__ = ["replacing", "sync_folder", "write_durably"]
 
 
 @contextmanager
@@ -20,3 +20,37 @@ def replacing(path: Path) -> Iterator[BufferedWriter]:
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+
+
+def write_durably(path: Path, content: memoryview) -> None:
+    """Write a whole file and wait until the disk has it.
+
+    Args:
+        path: of a file that nobody reads yet.
+        content: bytes.
+
+    Raises:
+        OSError: it cannot be written, or reads back as something else.
+    """
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+    try:
+        rest = content
+        while len(rest):
+            written = os.write(file, rest)
+            if not written:
+                raise OSError(f"{path}: nothing was written of {len(rest)} bytes")
+            rest = rest[written:]
+        os.fsync(file)
+    finally:
+        os.close(file)
+    if path.read_bytes() != content:
+        raise OSError(f"{path} reads back otherwise than it was written: is the disk sound?")
+
+
+def sync_folder(path: Path) -> None:
+    """Wait until the disk has the names in a folder."""
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

@@ -200,7 +200,7 @@ class FrameReplayBuffer(BaseBuffer):
         )
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """Everything in the buffer as plain arrays, for ``numpy.savez``."""
+        """Everything in the buffer as plain arrays, not copied."""
         used = slice(0, min(self.total + 1, self.n_frames))
         filled = slice(0, min(self.total, self.buffer_size))
         keys = sorted(self.ends)
@@ -219,7 +219,7 @@ class FrameReplayBuffer(BaseBuffer):
         }
 
     def load_state(self, state: dict[str, npt.NDArray[Any]]) -> None:
-        """Take over what ``state`` returned; the open episode is closed as a timeout.
+        """Take over what ``state`` returned, open episodes included.
 
         Raises:
             ValueError: the state is that of a buffer of another size or shape.
@@ -242,7 +242,6 @@ class FrameReplayBuffer(BaseBuffer):
         }
         self.total, self._age = total, state["age"].astype(np.int32)
         self.pos, self.full = total % self.buffer_size, total >= self.buffer_size
-        self.close_episodes()
 
     def close_episodes(self) -> None:
         """End every open episode as truncated, because its continuation will never be added."""

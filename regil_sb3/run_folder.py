@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
 from regil_sb3.files import replacing
-from regil_sb3.replay_buffer import FrameReplayBuffer
-from regil_sb3.success_buffer import SuccessBuffer
-from regil_sb3.td3bc import TD3BC
 
 
 def refuse_finished(run: Path) -> None:
@@ -62,27 +62,40 @@ def load_calibration(env: VecEnv, path: Path) -> bool:
     return True
 
 
-def save_buffers(model: TD3BC, path: Path) -> None:
-    """Save what ``resume`` needs; SB3's own replay buffers (no images) have no such form."""
-    if not isinstance(model.replay_buffer, FrameReplayBuffer):
-        return
-    buffers = {"success": model.success_buffer.state(), "replay": model.replay_buffer.state()}
-    arrays: dict[str, Any] = {
-        f"{name}/{k}": v for name, state in buffers.items() for k, v in state.items()
-    }
-    with replacing(path) as file:
-        np.savez(file, **arrays)
+def checkpoints_of(run: Path) -> Path:
+    """Where a run's checkpoints are until it has ended."""
+    return run / "checkpoints"
 
 
-def load_buffers(model: TD3BC, path: Path) -> None:
-    """Give a model what ``save_buffers`` kept."""
-    with np.load(path, allow_pickle=False) as arrays:
-        for name, buffer in (("success", model.success_buffer), ("replay", model.replay_buffer)):
-            prefix = f"{name}/"
-            state = {k.removeprefix(prefix): arrays[k] for k in arrays if k.startswith(prefix)}
-            if state:
-                assert isinstance(buffer, SuccessBuffer | FrameReplayBuffer)
-                buffer.load_state(state)
+def forget_checkpoints(run: Path) -> None:
+    """Training has ended: remove them, in one step."""
+    old = run / ".checkpoints"
+    shutil.rmtree(old, ignore_errors=True)
+    if checkpoints_of(run).exists():
+        checkpoints_of(run).rename(old)
+        shutil.rmtree(old)
+
+
+@contextmanager
+def locked(run: Path) -> Iterator[None]:
+    """Let no other process write in the folder meanwhile; a killed one locks nothing.
+
+    Raises:
+        ValueError: another one does.
+    """
+    with (run / ".lock").open("a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            raise ValueError(
+                f"process {file.read().strip()} is learning in {run}: wait for it, or choose "
+                "another --out"
+            ) from error
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        yield
 
 
 class AppendingCSV(CSVOutputFormat):

@@ -146,7 +146,7 @@ class SuccessBuffer:
         return [(len(e), _film(e.observations)) for e in (*self._pinned, *self._episodes)]
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
-        """The episodes that are not pinned as plain arrays, for ``numpy.savez``."""
+        """The episodes that are not pinned as plain arrays, not copied."""
         out: dict[str, npt.NDArray[Any]] = {"episodes": np.array(len(self._episodes))}
         for i, episode in enumerate(self._episodes):
             out[f"{i}/actions"] = episode.actions

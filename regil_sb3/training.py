@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 from tqdm import tqdm
 
 from regil_sb3.baselines import BAKU, BC, Offline, vinn_act
+from regil_sb3.checkpoint import CheckpointCallback
 from regil_sb3.evaluation import (
     EVALUATION_SEED,
     SELECTION_SEED,
@@ -35,13 +36,15 @@ from regil_sb3.evaluation import (
     policy_act,
 )
 from regil_sb3.files import replacing
+from regil_sb3.open_episode import ReplayableEpisode
 from regil_sb3.run_folder import (
     AppendingCSV,
     best_so_far,
-    load_buffers,
+    checkpoints_of,
+    forget_checkpoints,
     load_calibration,
+    locked,
     refuse_finished,
-    save_buffers,
     save_calibration,
     save_model,
 )
@@ -71,7 +74,7 @@ def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEn
     def wrap(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
         for wrapper, arguments in wrappers:
             env = wrapper(env, **arguments)
-        return env
+        return ReplayableEpisode(env)
 
     try:
         env: VecEnv = make_vec_env(
@@ -199,72 +202,83 @@ def train(settings: Settings, demo: Demonstration, run: Path) -> None:
     """
     refuse_finished(run)
     run.mkdir(parents=True, exist_ok=True)
-    demo.save(run / "demo.hdf5")
-    with _environments(settings, run / "demo.hdf5") as (env, eval_env):
-        model = _new_model(settings, demo, env)
-        if isinstance(model, TD3BC) and settings.steps <= model.warmup_steps:
-            raise ValueError(
-                f"{settings.steps} steps end before the warm-up of {model.warmup_steps} does: take "
-                "more --steps, or a smaller --set warmup_steps=N"
+    with locked(run):
+        demo.save(run / "demo.hdf5")
+        with _environments(settings, run / "demo.hdf5") as (env, eval_env):
+            model = _new_model(settings, demo, env)
+            if isinstance(model, TD3BC) and settings.steps <= model.warmup_steps:
+                raise ValueError(
+                    f"{settings.steps} steps end before the warm-up of {model.warmup_steps} does: "
+                    "take more --steps, or a smaller --set warmup_steps=N"
+                )
+            env.reset()  # where the retrieval wrappers compare first frames
+            settings.save(
+                run / "config.yaml",
+                encoder=settings.retrieval("encoder"),
+                k=settings.retrieval("k"),
+                horizon=settings.retrieval("horizon"),
+                action_repeat=action_repeat(env),
             )
-        env.reset()  # where the retrieval wrappers compare first frames
-        settings.save(
-            run / "config.yaml",
-            encoder=settings.retrieval("encoder"),
-            k=settings.retrieval("k"),
-            horizon=settings.retrieval("horizon"),
-            action_repeat=action_repeat(env),
-        )
-        _learn(model, settings, run, eval_env)
+            _learn(model, settings, run, eval_env)
 
 
 def resume(run: Path) -> Settings:
-    """Go on where an interrupted run stopped; the open episode is lost.
+    """Go on with a run that was interrupted, wherever it was, as if it had not been.
+
+    One that learns from the demonstration alone goes on where Ctrl-C stopped it.
 
     Raises:
         ValueError: no run, or one that has ended already.
     """
     settings = Settings.load(run / "config.yaml")
-    algorithm = ALGOS[settings.algo]
-    offline = issubclass(algorithm, Offline)
-    if not offline and not (run / "buffers.npz").exists():
-        raise ValueError(
-            f"{run} was not interrupted by Ctrl-C, so it has no replay buffer to go on with: "
-            "start a new run, or use `regil evaluate` on this one"
-        )
-    with _environments(settings, run / "demo.hdf5") as (env, eval_env):
-        model = algorithm.load(
-            run / "model.zip", env=env, demo=Demonstration.load(run / "demo.hdf5")
-        )
-        if model.num_timesteps >= settings.steps:
-            raise ValueError(f"{run} has made its {settings.steps} steps: use `regil evaluate`")
-        if isinstance(model, TD3BC) and not offline:
-            load_buffers(model, run / "buffers.npz")
-        load_calibration(env, run / "calibration.json")
-        _learn(model, settings, run, eval_env)
+    demo = Demonstration.load(run / "demo.hdf5")
+    offline = issubclass(ALGOS[settings.algo], Offline)
+    with locked(run):
+        if not offline and (run / "model.zip").exists() and not checkpoints_of(run).exists():
+            raise ValueError(
+                f"{run} has learned all its steps: start a new run, or use `regil evaluate` on "
+                "this one"
+            )
+        with _environments(settings, run / "demo.hdf5") as (env, eval_env):
+            if offline:
+                model = ALGOS[settings.algo].load(run / "model.zip", env=env, demo=demo)
+                if model.num_timesteps >= settings.steps:
+                    raise ValueError(
+                        f"{run} has made its {settings.steps} steps: use `regil evaluate`"
+                    )
+            else:
+                model = _new_model(settings, demo, env)
+                env.reset()  # as a new run does: it may have been killed before a checkpoint
+            _learn(model, settings, run, eval_env)
     return settings
 
 
 def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> None:
+    log = run / "progress.csv"
+    checkpoints = None
+    if isinstance(model, TD3BC) and not isinstance(model, Offline):
+        checkpoints = CheckpointCallback(checkpoints_of(run), log=log)
+        checkpoints.restore(model)
+    done = model.num_timesteps
+    if not done:
+        log.unlink(missing_ok=True)
     every = max(settings.steps // 6, 1)
     # The callback reads the log before it is reopened
     callback = TrainingCallback(run, eval_env, every, settings.eval_episodes)
-    formats = [AppendingCSV(run / "progress.csv"), TensorBoardOutputFormat(str(run))]
+    formats = [AppendingCSV(log), TensorBoardOutputFormat(str(run))]
     model.set_logger(Logger(str(run), formats))
-    fresh = model.num_timesteps == 0
+    both: list[BaseCallback] = [callback] if checkpoints is None else [callback, checkpoints]
     try:
-        model.learn(settings.steps - model.num_timesteps, callback, reset_num_timesteps=fresh)
+        model.learn(settings.steps - done, both, reset_num_timesteps=done == 0)
+        save_model(model, run / "model.zip")
+        forget_checkpoints(run)
     except KeyboardInterrupt:
-        save_model(model, run / "model.zip")
-        if not isinstance(model, Offline):
-            save_buffers(model, run / "buffers.npz")
-        assert model.env is not None
-        save_calibration(model.env, run / "calibration.json")
+        if checkpoints is None:
+            save_model(model, run / "model.zip")
         raise
-    else:
-        save_model(model, run / "model.zip")
-        (run / "buffers.npz").unlink(missing_ok=True)
     finally:
+        if checkpoints is not None:
+            checkpoints.close()
         if isinstance(model, TD3BC):
             save_films(model.success_buffer, run / "success_buffer.npz")
         callback.close()

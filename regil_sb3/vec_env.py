@@ -125,7 +125,8 @@ class VecRetrievalGuide(_VecRetrieval):
     observations and rewards pass through. ``info["retrieval"]`` of each environment holds what that
     one says; of an episode's first frame it is in ``reset_infos``. ``env_method`` and ``get_attr``
     know its guide_action, disturbed_action, plain_action, calibration, set_calibration,
-    target_shift and alignment: `TD3BC` warms up with it as with wrapped environments.
+    lasting_state, set_lasting_state, target_shift and alignment: `TD3BC` warms up with it as with
+    wrapped environments.
 
     Each environment has its own correction, which learns and calibrates for itself.
 
@@ -202,6 +203,8 @@ class VecRetrievalGuide(_VecRetrieval):
             calibration=lambda i: guides[i].calibration,
             set_calibration=lambda i: guides[i].set_calibration,
             target_shift=lambda i: guides[i].target_shift,
+            lasting_state=lambda i: guides[i].lasting,
+            set_lasting_state=lambda i: guides[i].set_lasting,
         )
 
     def guide_action(self) -> npt.NDArray[np.float32]:

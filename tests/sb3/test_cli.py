@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import csv
+import functools
 import json
+import os
+import signal
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from regil_wrappers import Demonstration
 
 from regil_sb3 import TD3BC, training
+from regil_sb3.checkpoint import CheckpointCallback
 from regil_sb3.cli import main
-from regil_sb3.run_folder import save_model
+from regil_sb3.run_folder import locked, save_model
 from regil_sb3.settings import Settings, make_settings, presets
 from regil_sb3.training import TrainingCallback, make_env
 
@@ -89,26 +94,65 @@ def test_a_run_is_never_written_over(run, demo, capsys):
     assert "holds a run already" in capsys.readouterr().err
 
 
-def test_interrupted_run_saves_and_goes_on(demo, tmp_path, monkeypatch, capsys):
+class Killed(BaseException):
+    """What a process does not survive."""
+
+
+def test_run_killed_twice_ends_as_one_never_killed(run, demo, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "run"
     step = TrainingCallback._on_step
+    monkeypatch.setattr(
+        training, "CheckpointCallback", functools.partial(CheckpointCallback, steps=40)
+    )
 
-    def interrupt(self):
-        if self.num_timesteps == 170:
-            raise KeyboardInterrupt
-        return step(self)
+    def interrupt(at, how):
+        def on_step(self):
+            if self.num_timesteps == at:
+                how()
+            return step(self)
 
-    monkeypatch.setattr(TrainingCallback, "_on_step", interrupt)
-    words = ["train", "--env", ENV, "--demo", str(demo), "--out", str(folder), "--steps", "220"]
-    assert main([*words, *TINY]) == 130
+        monkeypatch.setattr(TrainingCallback, "_on_step", on_step)
+
+    def kill():
+        raise Killed
+
+    words = ["train", "--env", ENV, "--demo", str(demo), "--out", str(folder), "--steps", "260"]
+    interrupt(70, kill)
+    with pytest.raises(Killed):
+        main([*words, *TINY])
+    interrupt(190, functools.partial(signal.raise_signal, signal.SIGTERM))
+    with pytest.raises(SystemExit) as ended:
+        main(["train", "--resume", str(folder), "--episodes", "2"])
+    assert ended.value.code == 75
     assert f"regil train --resume {folder}" in capsys.readouterr().err
-    kept = len(rows(folder))
     monkeypatch.setattr(TrainingCallback, "_on_step", step)
-    assert main(["train", "--resume", str(folder), "--episodes", "1"]) == 0
-    assert TD3BC.load(folder / "model.zip").num_timesteps == 220
-    assert len(rows(folder)) > kept
-    assert not (folder / "buffers.npz").exists()
+    assert main(["train", "--resume", str(folder), "--episodes", "2"]) == 0
+
+    one, other = (TD3BC.load(f / "model.zip").get_parameters() for f in (folder, run))
+    for name, values in one["policy"].items():
+        assert torch.equal(values, other["policy"][name]), name
+    results = [json.loads((f / "evaluation.json").read_text()) for f in (folder, run)]
+    assert results[0]["policy"] == results[1]["policy"]
+    logs = [
+        [
+            {k: v for k, v in row.items() if k not in ("time/fps", "time/time_elapsed")}
+            for row in rows(f)
+        ]
+        for f in (folder, run)
+    ]
+    assert logs[0] == logs[1]
+    assert not (folder / "checkpoints").exists()
     assert main(["train", "--resume", str(folder)]) == 2
+    assert "has learned all its steps" in capsys.readouterr().err
+
+
+def test_two_runs_in_one_folder_are_refused(demo, tmp_path, capsys):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    words = ["train", "--env", ENV, "--demo", str(demo), "--out", str(folder)]
+    with locked(folder):
+        assert main(words) == 2
+    assert f"process {os.getpid()} is learning in {folder}" in capsys.readouterr().err
 
 
 def test_failed_save_loses_nothing(run, tmp_path, monkeypatch):

@@ -129,6 +129,17 @@ class Calibration:
         self._fit()
         self._done = []
 
+    def lasting(self) -> dict[str, Any]:
+        """What stays when an episode ends, as numbers and arrays."""
+        return {"done": [s.pictures for s in self._done], "in_vain": self._in_vain}
+
+    def set_lasting(self, lasting: dict[str, Any]) -> None:
+        """Take over what `lasting` gave, before any move was made."""
+        for pictures in lasting["done"]:
+            self._done.append(self._segments.pop(0))
+            self._done[-1].pictures = list(pictures)
+        self._in_vain = lasting["in_vain"]
+
     def _gripper_moves(self) -> _Segment:
         turned = self._idle.copy()
         i = self._gripper

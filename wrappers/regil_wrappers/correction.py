@@ -325,6 +325,31 @@ class Servo:
         self._calibration = None
         self._begin_episode()
 
+    def lasting(self) -> dict[str, Any]:
+        """All that stays when an episode ends, as numbers, text and arrays."""
+        return {
+            "generator": self._rng.bit_generator.state,
+            "calibration": None if self._calibration is None else self._calibration.lasting(),
+            "calibrated": self.state(),
+            "off_plane": self._off_plane,
+            "disturbs": self._disturbs,
+        }
+
+    def set_lasting(self, lasting: dict[str, Any]) -> None:
+        """Take over what `lasting` gave; ask nothing before the next `reset`.
+
+        Raises:
+            ValueError: as `load_state`, and where this one's calibration has begun.
+        """
+        if lasting["calibrated"] is not None:
+            self.load_state(lasting["calibrated"])
+        elif self._calibration is None or self._calibration.lasting()["done"]:
+            raise ValueError("a guide that has begun its calibration takes no earlier one")
+        else:
+            self._calibration.set_lasting(lasting["calibration"])
+        self._rng.bit_generator.state = lasting["generator"]
+        self._off_plane, self._disturbs = lasting["off_plane"], lasting["disturbs"]
+
     # -- replaying -------------------------------------------------------------------------------
 
     def _begin_replay(

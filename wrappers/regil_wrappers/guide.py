@@ -184,6 +184,21 @@ class Guide:
             raise ValueError("a guide without correction takes no calibration")
         self.servo.load_state(calibration)
 
+    def lasting(self) -> dict[str, Any] | None:
+        """All that stays when an episode ends; None where nothing does."""
+        return None if self.servo is None else self.servo.lasting()
+
+    def set_lasting(self, lasting: dict[str, Any] | None) -> None:
+        """Take over what `lasting` gave.
+
+        Raises:
+            ValueError: if it is not from such a guide.
+        """
+        if (self.servo is None) != (lasting is None):
+            raise ValueError("what lasts of a guide with correction is not for one without")
+        if self.servo is not None and lasting is not None:
+            self.servo.set_lasting(lasting)
+
     def said(self) -> dict[str, Any]:
         """What ``info["retrieval"]`` holds of it."""
         said: dict[str, Any] = {"guide_action": self.action()}

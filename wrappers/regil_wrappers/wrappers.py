@@ -241,6 +241,21 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         """
         self._guide.set_calibration(calibration)
 
+    def lasting_state(self) -> dict[str, Any] | None:
+        """All that the guide keeps when an episode ends: numbers, text and arrays; None: nothing.
+
+        More than `calibration`: a half-done one, and its generator.
+        """
+        return self._guide.lasting()
+
+    def set_lasting_state(self, lasting: dict[str, Any] | None) -> None:
+        """Take over what `lasting_state` gave, into a new guide, before `reset`.
+
+        Raises:
+            ValueError: if it is not from such a guide.
+        """
+        self._guide.set_lasting(lasting)
+
 
 class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.RecordConstructorArgs):
     """Rewards following the demonstration.

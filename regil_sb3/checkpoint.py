@@ -1,0 +1,226 @@
+"""Crash-safe checkpoints, from which training goes on as if it had never stopped.
+
+* ``CheckpointCallback`` - saves now and then, and when the process is told to end
+* ``Preempted`` - ends a process that was told to: exit status 75, "try again"
+
+A checkpoint executes nothing when it is read: it is JSON and arrays (`regil_sb3.generations`).
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+import warnings
+from os import PathLike
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from regil_sb3.generations import Generations
+from regil_sb3.learner_state import check_can_be_kept, learner_state, load_learner_state
+from regil_sb3.td3bc import TD3BC
+
+__all__ = ["CheckpointCallback", "Preempted"]
+
+TRY_AGAIN = 75  # EX_TEMPFAIL of sysexits.h
+_SHARE = 0.05  # of the time, at most, goes into saving
+
+
+class Preempted(SystemExit):
+    """The process was told to end (SIGTERM), and training can go on later."""
+
+    def __init__(self) -> None:
+        super().__init__(TRY_AGAIN)
+
+
+class CheckpointCallback(BaseCallback):
+    """Saves all that decides how learning goes on, so that it may be killed at any moment.
+
+    Going on from a checkpoint, `TD3BC` learns to the last bit what it would have learned without
+    the interruption, where each environment is wrapped in `ReplayableEpisode` (regil_sb3.
+    open_episode) and its episodes follow from its generator and the actions. Else the open episodes
+    are ended as truncated, and a warning says so.
+
+    SIGTERM (a scheduler's preemption) and Ctrl-C save after the step that is under way, and end in
+    `Preempted` (exit status 75) or KeyboardInterrupt. What takes longer than ``grace`` is broken
+    off then; the last checkpoint stays.
+
+    Example:
+        >>> from regil_sb3 import TD3BC
+        >>> from regil_sb3.checkpoint import CheckpointCallback
+        >>> def life(folder, env, steps):
+        ...     model = TD3BC("MlpPolicy", env, bc_coef=0, warmup_steps=0, buffer_size=100)
+        ...     checkpoints = CheckpointCallback(folder, steps=20)
+        ...     done = checkpoints.restore(model)  # 0 where there is no checkpoint yet
+        ...     model.learn(steps - done, checkpoints, reset_num_timesteps=done == 0)
+        ...     return done
+        >>> env = ReplayableEpisode(gym.make("Pendulum-v1"))
+        >>> life(folder, env, 50), life(folder, env, 70)
+        (0, 40)
+
+    Args:
+        folder: of the checkpoints.
+        seconds: between two of them, or more, where saving would else take over a twentieth of the
+            time.
+        steps: instead: environment steps between two of them.
+        keep: how many stay.
+        max_bytes: what all may take on disk; the oldest go first, the newest never. None: anything.
+        grace: seconds from SIGTERM or Ctrl-C to the end of the process.
+        log: a text file that goes back to what it held then: a logger's.
+
+    Raises:
+        ValueError: an argument is out of range; from `restore` and ``learn``, if the model does not
+            fit, or holds what a checkpoint does not.
+    """
+
+    def __init__(
+        self,
+        folder: str | PathLike[str],
+        seconds: float = 300.0,
+        steps: int | None = None,
+        keep: int = 2,
+        max_bytes: int | None = None,
+        grace: float = 20.0,
+        log: Path | None = None,
+    ) -> None:
+        super().__init__()
+        if seconds < 0 or grace <= 0 or (steps is not None and steps < 1):
+            raise ValueError(
+                f"seconds={seconds}, steps={steps}, grace={grace}: they must be positive"
+            )
+        self.generations = Generations(Path(folder), keep, max_bytes)
+        self.seconds, self.steps, self.grace, self.log = seconds, steps, grace, log
+        self._told: int | None = None  # the signal that came
+        self._saving = False
+        self._before: dict[int, Any] = {}  # signals' handlers of others
+        self._saved_at = 0  # the step of the last checkpoint
+        self._next = 0.0  # the time of the next one, on time.monotonic
+        self._failed = ""
+        self._pending: list[dict[str, Any]] = []  # of the logger
+
+    def restore(self, model: TD3BC) -> int:
+        """Bring a new model to where the newest checkpoint left one like it.
+
+        Returns:
+            the steps it has learned for; 0 where there is no checkpoint.
+
+        Raises:
+            ValueError: the checkpoint is of another model or of other environments.
+            MemoryError: it would not fit into memory.
+        """
+        state = self.generations.load()
+        if state is None:
+            return 0
+        check_can_be_kept(model)
+        lost = load_learner_state(model, state["learner"])
+        if lost:
+            warnings.warn(
+                f"going on at step {model.num_timesteps}, the open episodes are ended as "
+                f"truncated: {'; '.join(lost)}",
+                stacklevel=2,
+            )
+        if self.log is not None and state["log"] is not None:
+            self.log.write_text(state["log"], encoding="utf-8")
+        self._pending = state["logger"]
+        self._saved_at = model.num_timesteps
+        return int(model.num_timesteps)
+
+    def save(self) -> None:
+        """Save now.
+
+        Raises:
+            OSError: it could not be written; the earlier ones are as they were.
+        """
+        assert isinstance(self.model, TD3BC)
+        has_log = self.log is not None and self.log.exists()
+        self._saving = True
+        try:
+            self.generations.save(
+                {
+                    "learner": learner_state(self.model),
+                    "logger": [
+                        dict(self.logger.name_to_value),
+                        dict(self.logger.name_to_count),
+                    ],
+                    "log": self.log.read_text(encoding="utf-8") if self.log and has_log else None,
+                }
+            )
+        finally:
+            self._saving = False
+        self._saved_at = self.num_timesteps
+
+    def _on_training_start(self) -> None:
+        assert isinstance(self.model, TD3BC)
+        check_can_be_kept(self.model)
+        if self._pending:
+            self.logger.name_to_value.update(self._pending[0])
+            self.logger.name_to_count.update(self._pending[1])
+            self._pending = []
+        self._next = time.monotonic() + self.seconds
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                self._before[number] = signal.signal(number, self._tell)
+
+    def _on_rollout_start(self) -> None:
+        if self._told is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            if self.num_timesteps != self._saved_at or not self.generations.numbers:
+                self._save_or_warn()
+            raise self._end(self._told)
+        if not self.generations.numbers and not self._failed:
+            self._save_or_warn()
+        elif self.steps is not None:
+            if self.num_timesteps - self._saved_at >= self.steps:
+                self._save_or_warn()
+        elif time.monotonic() >= self._next:
+            self._save_or_warn()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave signals to who had them before; done at the end of ``learn``."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if self._before:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        self._before = {}
+
+    def _save_or_warn(self) -> None:
+        began = time.monotonic()
+        try:
+            self.save()
+            self._failed = ""
+        except OSError as error:
+            if str(error) != self._failed:
+                self._failed = str(error)
+                warnings.warn(
+                    f"the checkpoint at step {self.num_timesteps} could not be saved ({error}): "
+                    f"training goes on; the last one is of step {self._saved_at}",
+                    stacklevel=2,
+                )
+        took = time.monotonic() - began
+        self._next = time.monotonic() + max(self.seconds, took * (1 / _SHARE - 1))
+
+    def _tell(self, number: int, _: FrameType | None) -> None:
+        """A signal came: save at the next step, or else end all the same."""
+        if self._told is not None:  # a second time
+            self._break_off(number, None)
+        self._told = number
+        self._before.setdefault(signal.SIGALRM, signal.signal(signal.SIGALRM, self._break_off))
+        signal.setitimer(signal.ITIMER_REAL, self.grace)
+
+    def _break_off(self, number: int, _: FrameType | None) -> None:
+        if self._saving:  # it is nearly done, and the end comes right after it
+            return
+        raise self._end(self._told if self._told is not None else number)
+
+    @staticmethod
+    def _end(number: int) -> BaseException:
+        return KeyboardInterrupt() if number == signal.SIGINT else Preempted()

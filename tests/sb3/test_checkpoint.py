@@ -1,0 +1,256 @@
+"""Runs that are killed and go on end as runs that never were, to the bit."""
+
+from __future__ import annotations
+
+import doctest
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from toy import Reach, demonstration
+
+from regil_sb3 import TD3BC, checkpoint, open_episode
+from regil_sb3.checkpoint import CheckpointCallback, Preempted
+from regil_sb3.learner_state import learner_state
+from regil_sb3.open_episode import ReplayableEpisode
+
+STEPS = 200
+
+
+def toy(n_envs=1, replayable=True, **kwargs):
+    def one():
+        env = Reach(**kwargs)
+        return ReplayableEpisode(env) if replayable else env
+
+    return VecFrameStack(DummyVecEnv([one] * n_envs), 2)
+
+
+def new_model(env, policy="CnnPolicy", **changes):
+    settings = {
+        "demo": demonstration(),
+        "buffer_size": 150,
+        "learning_starts": 20,
+        "batch_size": 8,
+        "warmup_steps": 60,
+        "guide_again": 0.5,
+        "bc_pretrain_steps": 5,
+        "bc_schedule": "success",
+        "keep_own_successes": True,
+        "success_buffer_size": 80,
+        "seed": 0,
+        "device": "cpu",
+    }
+    return TD3BC(policy, env, **{**settings, **changes})
+
+
+def test_the_examples_run(tmp_path):
+    for module in (checkpoint, open_episode):
+        own = {"folder": tmp_path, "gym": gym, "ReplayableEpisode": ReplayableEpisode}
+        failed, tried = doctest.testmod(module, extraglobs=own)
+        assert failed == 0 < tried
+
+
+class Killed(BaseException):
+    """What a process does not survive."""
+
+
+class KillAt(BaseCallback):
+    def __init__(self, step):
+        super().__init__()
+        self.step = step
+
+    def _on_step(self):
+        if self.num_timesteps >= self.step:
+            raise Killed
+        return True
+
+
+def flat(tree, at=""):
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            yield from flat(value, f"{at}/{key}")
+    elif isinstance(tree, list | tuple):
+        for i, value in enumerate(tree):
+            yield from flat(value, f"{at}/{i}")
+    elif not at.endswith("/t"):  # Monitor's seconds
+        yield at, np.asarray(getattr(tree, "rows", tree))
+
+
+def assert_same(ended, never_killed):
+    a, b = dict(flat(ended)), dict(flat(never_killed))
+    assert a.keys() == b.keys()
+    different = [at for at in a if not np.array_equal(a[at], b[at])]
+    assert not different
+
+
+def live(folder, env, kill_at=None, every=23, **changes):
+    """One life of a process: its model's state at the end, or None where it was killed."""
+    model = new_model(env, **changes)
+    checkpoints = CheckpointCallback(folder, steps=every)
+    done = checkpoints.restore(model)
+    callbacks = [checkpoints] + ([] if kill_at is None else [KillAt(done + kill_at)])
+    try:
+        model.learn(STEPS - done, callbacks, reset_num_timesteps=done == 0)
+        return learner_state(model)
+    except Killed:
+        return None
+    finally:
+        checkpoints.close()
+
+
+@pytest.mark.parametrize(
+    ("of_env", "changes"),
+    [
+        ({}, {}),
+        ({"n_envs": 2}, {"train_freq": 3, "gradient_steps": 2}),
+        (
+            {"dict_obs": True},
+            {"policy": "MultiInputPolicy", "n_steps": 1, "demo": None, "bc_coef": 0.0},
+        ),
+    ],
+    ids=["images", "two environments", "dict"],
+)
+def test_killed_again_and_again_ends_the_same(of_env, changes, tmp_path):
+    never_killed = live(tmp_path / "whole", toy(**of_env), **changes)
+    rng = np.random.default_rng(0)
+    ended, lives = None, 0
+    while ended is None:
+        lives += 1
+        ended = live(tmp_path / "chain", toy(**of_env), int(rng.integers(2, 70)), **changes)
+    assert lives > 4
+    assert_same(ended, never_killed)
+
+
+def test_open_episodes_that_cannot_be_replayed_are_truncated(tmp_path):
+    assert live(tmp_path, toy(replayable=False), 100, every=25) is None
+    model = new_model(toy(replayable=False))
+    checkpoints = CheckpointCallback(tmp_path, steps=25)
+    with pytest.warns(UserWarning, match="ended as truncated: its environment is no Replayable"):
+        done = checkpoints.restore(model)
+    buffer = model.replay_buffer
+    assert done == buffer.total == 75
+    was_open = buffer.dones[done - 1] == 0
+    assert was_open.all()
+    model.learn(STEPS - done, checkpoints, reset_num_timesteps=False)
+    assert (buffer.timeouts[done - 1] == 1).all()
+    assert model.num_timesteps == STEPS
+
+
+class Moody(Reach):
+    """Where it goes does not follow from its generator."""
+
+    lives = 0
+
+    def reset(self, **kwargs):
+        out = super().reset(**kwargs)
+        Moody.lives += 1
+        self.x += 0.1 * Moody.lives
+        return out
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, reward - self.x, *rest
+
+
+def test_an_environment_that_is_not_deterministic_is_found_out(tmp_path):
+    def moody():
+        return VecFrameStack(DummyVecEnv([lambda: ReplayableEpisode(Moody())]), 2)
+
+    assert live(tmp_path, moody(), 100, every=27) is None
+    model = new_model(moody())
+    with pytest.warns(UserWarning, match="environment 0: its step 1 returned -"):
+        done = CheckpointCallback(tmp_path).restore(model)
+    model.learn(STEPS - done, reset_num_timesteps=False)
+
+
+def test_another_model_is_refused(tmp_path):
+    assert live(tmp_path, toy(), 50) is None
+    other = new_model(toy(), buffer_size=151)
+    with pytest.raises(ValueError, match="with the same arguments"):
+        CheckpointCallback(tmp_path).restore(other)
+    with pytest.raises(ValueError, match="the checkpoint is of other networks"):
+        CheckpointCallback(tmp_path).restore(new_model(toy(), policy_kwargs={"net_arch": [8]}))
+
+
+@pytest.mark.parametrize(
+    ("number", "ends"), [(signal.SIGTERM, Preempted), (signal.SIGINT, KeyboardInterrupt)]
+)
+def test_told_to_end_it_saves_the_step_under_way(number, ends, tmp_path):
+    class Tell(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 90:
+                signal.raise_signal(number)
+            return True
+
+    before = signal.getsignal(number)
+    checkpoints = CheckpointCallback(tmp_path)
+    model = new_model(toy())
+    with pytest.raises(ends) as told:
+        model.learn(STEPS, [checkpoints, Tell()])
+    checkpoints.close()
+    assert signal.getsignal(number) is before
+    if ends is Preempted:
+        assert told.value.code == 75
+    again = new_model(toy())
+    assert CheckpointCallback(tmp_path).restore(again) == 90
+
+
+def test_what_takes_too_long_is_broken_off(tmp_path):
+    class Hang(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 90:
+                signal.raise_signal(signal.SIGTERM)
+                threading.Event().wait(60)
+            return True
+
+    checkpoints = CheckpointCallback(tmp_path, steps=40, grace=0.2)
+    with pytest.raises(Preempted):
+        new_model(toy()).learn(STEPS, [checkpoints, Hang()])
+    checkpoints.close()
+    assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 80
+
+
+CHILD = """
+import sys
+from test_checkpoint import live, toy, learner_state, flat
+state = live(sys.argv[1], toy(), every=9)
+import hashlib
+h = hashlib.sha256()
+for at, array in sorted(flat(state), key=lambda pair: pair[0]):
+    h.update(f"{at} {array.dtype} {array.tolist()!r}".encode())
+print(h.hexdigest())
+"""
+
+
+def test_a_process_killed_for_real(tmp_path):
+    def child(folder):
+        return subprocess.Popen(
+            [sys.executable, "-c", CHILD, str(folder)],
+            cwd=Path(__file__).parent,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def generations(folder):
+        return [int(p.name) for p in folder.glob("0*") if p.name.isdecimal()]
+
+    whole = child(tmp_path / "whole")
+    for stop_at in (4, 12):
+        killed = child(tmp_path / "chain")
+        while max(generations(tmp_path / "chain"), default=0) < stop_at:
+            assert killed.poll() is None, "it ended before it was killed"
+            threading.Event().wait(0.01)
+        killed.kill()
+        assert killed.wait() == -signal.SIGKILL
+        killed.stdout.close()
+    last = child(tmp_path / "chain")
+    ends = [process.communicate()[0] for process in (whole, last)]
+    assert whole.returncode == last.returncode == 0
+    assert ends[0] == ends[1] != ""
