@@ -285,6 +285,7 @@ def _train(args: argparse.Namespace) -> None:
 
     from regil_sb3 import process, training
     from regil_sb3.checkpoint import Preempted
+    from regil_sb3.robots.interfaces import RobotError
     from regil_sb3.run_folder import checkpoints_of, refuse_finished
     from regil_sb3.settings import encoder_size, make_settings
 
@@ -319,7 +320,7 @@ def _train(args: argparse.Namespace) -> None:
                         "or name yours with --demo"
                     ) from error
             training.train(settings, Demonstration.load(demo), run)
-    except (KeyboardInterrupt, Preempted):
+    except (KeyboardInterrupt, Preempted, RobotError):
         if checkpoints_of(run).exists():
             print(f"\nsaved; go on with: regil train --resume {run}", file=sys.stderr)
         elif (run / "model.zip").exists():

@@ -82,8 +82,6 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         reset_scene: puts the scene back, once the hand is home; asks the operator where there is
             one and this is None.
         operator: a person at the keyboard.
-        teleop: what the person wants now, (4,); `expert_action` gives it, so that `regil record`
-            records it.
         start_noise: (3,) m, the hand starts up to so far from home, drawn anew each episode.
         closed: whether an episode starts with a closed gripper.
         rate: control steps a second.
@@ -110,7 +108,6 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         success: Callable[[Picture, ArmState], bool] | None = None,
         reset_scene: Callable[[], None] | None = None,
         operator: Operator | None = None,
-        teleop: Callable[[], npt.NDArray[np.float32]] | None = None,
         start_noise: npt.ArrayLike = (0.0, 0.0, 0.0),
         closed: bool = False,
         rate: float = 30.0,
@@ -140,7 +137,7 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         self.render_mode = render_mode
         self._camera, self._arm, self.limits = camera, arm, limits
         self._success, self._reset_scene = success, reset_scene
-        self._operator, self._teleop = operator, teleop
+        self._operator = operator
         self._closed, self._size, self._max_steps = closed, size, max_steps
         self._period = 1.0 / rate
         self._patience = patience or Patience()
@@ -329,16 +326,6 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
             if self._steps >= 0 and self.fault is None:
                 self._target = self._arm.state().position.copy()
                 self._due = self._tick + self._patience.step * self._period
-
-    def expert_action(self) -> npt.NDArray[np.float32]:
-        """What the person at the controls wants now, (4,) in [-1, 1].
-
-        Raises:
-            ValueError: there is none.
-        """
-        if self._teleop is None:
-            raise ValueError("this robot has no teleop=: nobody says what to do")
-        return np.clip(self._teleop(), -1.0, 1.0).astype(np.float32)
 
     def encoder_frame(self, size: int) -> npt.NDArray[np.uint8]:
         """The newest picture for an encoder that wants it larger, (size, size, 3) uint8.
