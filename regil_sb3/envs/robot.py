@@ -150,6 +150,7 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         self._watched = False  # whether the watchdog looks
         self._due = np.inf  # when the next step has to come
         self._paused = self._gone = False
+        self._rests, self._tick = True, 0.0  # no step is due; when the next observation is
         self._unread = False  # an episode is open whose end the writer has not been told
         self._steps = -1  # of the episode; -1: there is none
         self._same, self._same_since = 0, np.zeros(3)
@@ -219,11 +220,7 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
                     raise
         self._target = self._arm.state().position.copy()
         self._steps, self._same = 0, 0
-        now = self._clock.now()
-        self._tick = now + self._period
-        self.times.begin(now)
-        with self._lock:
-            self._due = self._tick + self._patience.step * self._period
+        self._rests = True
         frame = self._observation()
         if self._writer is not None:
             self._writer.begin(frame)
@@ -253,7 +250,12 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
             raise ValueError(f"action {action} must be 4 finite numbers")
         action = np.clip(action, -1.0, 1.0)
         self._hold_while_paused()
-        self._tick = self.times.arrived(self._clock.now(), self._tick)
+        now = self._clock.now()
+        if self._rests:  # who begins may think as long as it takes: the arm stands still
+            self._rests, self._tick = False, now + self._period
+            self.times.begin(now)
+        else:
+            self._tick = self.times.arrived(now, self._tick)
         closed = bool(action[3] > 0)
         with self._lock:  # the watchdog cannot stop the arm between this question and the motion
             if self.fault is None:
@@ -319,13 +321,9 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         """Go on after ``pause``."""
         with self._lock:
             self._arm.recover()
-            self._paused = False
-            now = self._clock.now()
-            self._tick = now + self._period
-            self.times.begin(now)
+            self._paused, self._rests = False, True
             if self._steps >= 0 and self.fault is None:
                 self._target = self._arm.state().position.copy()
-                self._due = self._tick + self._patience.step * self._period
 
     def encoder_frame(self, size: int) -> npt.NDArray[np.uint8]:
         """The newest picture for an encoder that wants it larger, (size, size, 3) uint8.
