@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import doctest
+import errno
+import os
 import signal
 import subprocess
 import sys
@@ -200,6 +202,23 @@ def test_told_to_end_it_saves_the_step_under_way(number, ends, tmp_path):
         assert told.value.code == 75
     again = new_model(toy())
     assert CheckpointCallback(tmp_path).restore(again) == 90
+
+
+def test_a_full_disk_is_named_and_training_goes_on(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    class Fill(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 55:
+                monkeypatch.setattr(os, "write", full)
+            return True
+
+    model = new_model(toy())
+    with pytest.warns(UserWarning, match="at step 75 could not be saved .*No space.* of step 50"):
+        model.learn(110, [CheckpointCallback(tmp_path, steps=25), Fill()])
+    assert model.num_timesteps == 110
+    assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 50
 
 
 def test_what_takes_too_long_is_broken_off(tmp_path):
