@@ -94,7 +94,7 @@ def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 2 * 2 * 5 + 1
     assert said[-1] == "20 of 20 runs to make: about 5.0 hours, 1 at a time"
-    assert any("--set warmup_steps=0 --set guide_again=0 --set bc_coef=0" in line for line in said)
+    assert any("--preset ablation-rl " in line for line in said)
     assert not list(tmp_path.iterdir())
     for words in (["--methods", "magic"], ["--workers", "0"], ["--plot", "x"]):
         assert main(["bench", "ablations", *words]) == 2
