@@ -226,7 +226,11 @@ def test_command(words, says, folder, monkeypatch, capsys):
     assert said.err.strip().splitlines() == lines
     assert len(lines) == 1
     assert says in lines[0]
-    left = [f for f in folder.rglob("*") if f not in before and f.name not in ("demo.hdf5", "new")]
+    left = [
+        f
+        for f in folder.rglob("*")
+        if f not in before and f.name not in ("demo.hdf5", "new", ".lock")
+    ]
     assert not left
     for file in {f for f in folder.rglob("*")} - set(before):
         if file.is_file():

@@ -103,7 +103,9 @@ def test_what_a_model_does_not_need_is_refused_in_one_line(saved, tmp_path, name
 def test_trusted_files_run_what_they_say(saved, tmp_path):
     """Else the test above could not fail."""
     marker = tmp_path / "executed"
-    path = with_pickle(saved, tmp_path / "own.zip", dict(pickles(marker))["os.system"], "_last_obs")
+    path = with_pickle(
+        saved, tmp_path / "own.zip", dict(pickles(marker))["os.system"], "ep_info_buffer"
+    )
     TD3BC.load(path, trust=True)
     assert marker.exists()
 
