@@ -136,12 +136,13 @@ def _train(run: Run) -> None:
     from regil_wrappers import Demonstration
 
     from regil_sb3 import process, training
-    from regil_sb3.settings import make_settings
+    from regil_sb3.settings import Settings, make_settings
 
     process.keep_freed_memory()
     process.set_threads()
-    if (run.folder / "config.yaml").exists():
-        training.resume(run.folder)
+    if (config := run.folder / "config.yaml").exists():
+        if not training.has_learned(run.folder, Settings.load(config)):
+            training.resume(run.folder)
     else:
         settings = make_settings(
             run.env, run.preset or None, run.seed, run.steps, list(run.settings)

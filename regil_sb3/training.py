@@ -222,6 +222,16 @@ def train(settings: Settings, demo: Demonstration, run: Path) -> None:
             _learn(model, settings, run, eval_env)
 
 
+def has_learned(run: Path, settings: Settings) -> bool:
+    """Whether a run has made all its steps, evaluated or not."""
+    algo = ALGOS[settings.algo]
+    if not (run / "model.zip").exists():
+        return False
+    if issubclass(algo, Offline):
+        return bool(algo.load(run / "model.zip").num_timesteps >= settings.steps)
+    return not checkpoints_of(run).exists()
+
+
 def resume(run: Path) -> Settings:
     """Go on with a run that was interrupted, wherever it was, as if it had not been.
 
@@ -234,7 +244,7 @@ def resume(run: Path) -> Settings:
     demo = Demonstration.load(run / "demo.hdf5")
     offline = issubclass(ALGOS[settings.algo], Offline)
     with locked(run):
-        if not offline and (run / "model.zip").exists() and not checkpoints_of(run).exists():
+        if has_learned(run, settings):
             raise ValueError(
                 f"{run} has learned all its steps: start a new run, or use `regil evaluate` on "
                 "this one"
@@ -242,10 +252,6 @@ def resume(run: Path) -> Settings:
         with _environments(settings, run / "demo.hdf5") as (env, eval_env):
             if offline:
                 model = ALGOS[settings.algo].load(run / "model.zip", env=env, demo=demo)
-                if model.num_timesteps >= settings.steps:
-                    raise ValueError(
-                        f"{run} has made its {settings.steps} steps: use `regil evaluate`"
-                    )
             else:
                 model = _new_model(settings, demo, env)
                 env.reset()  # as a new run does: it may have been killed before a checkpoint

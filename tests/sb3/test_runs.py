@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import subprocess
+import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -114,3 +119,61 @@ def test_what_is_written(runs, failed, tmp_path, monkeypatch):
         float(text.split("| ReGIL | ")[1].split(" ")[0]), abs=1e-3
     )
     assert (tmp_path / "ablations.tex").read_text().count(r"\\") == 2
+
+
+_BENCH = """
+from pathlib import Path
+from test_runs import toy_run
+from regil_sb3.runs import finish
+finish(toy_run(Path({!r}), steps=600))
+"""
+
+
+@pytest.mark.slow
+def test_a_bench_that_was_killed_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")]))
+    run = toy_run(tmp_path, steps=600)
+    bench = subprocess.Popen([sys.executable, "-c", _BENCH.format(str(tmp_path))])
+    while not (run.folder / "progress.csv").exists():
+        time.sleep(0.1)
+    bench.send_signal(signal.SIGKILL)
+    bench.wait()
+    time.sleep(3)  # its run saves itself
+    assert not run.finished
+    assert finish_all([run]) == []
+    assert run.finished
+    (run.folder / "evaluation.json").unlink()  # as if it had been killed before
+    assert finish_all([run]) == []
+    assert run.finished
+
+
+@pytest.mark.slow
+def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
+    """Two nodes of a Ray cluster on this machine; one is killed when both have a run under way."""
+    pytest.importorskip("ray")
+    import ray
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")]))
+    runs = [toy_run(tmp_path, seed=seed, steps=600) for seed in range(3)]
+    memory = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
+    cluster = Cluster(initialize_head=True, head_node_args=memory)
+    try:
+        lost = cluster.add_node(**memory)
+        ray.init(address=cluster.address, log_to_driver=False)
+
+        def kill() -> None:
+            while sum((run.folder / "progress.csv").exists() for run in runs) < 2:
+                time.sleep(0.2)
+            cluster.remove_node(lost, allow_graceful=False)
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        assert finish_all(runs, ray="auto") == []
+        killer.join()
+        assert all(run.finished for run in runs)
+        policies = [(run.folder / "log.txt").read_text().count("evaluating policy") for run in runs]
+        assert all(policies)
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
