@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +28,7 @@ from regil_sb3.baselines import BAKU, BC, Offline, vinn_act
 from regil_sb3.checkpoint import CheckpointCallback
 from regil_sb3.evaluation import (
     EVALUATION_SEED,
+    METHODS,
     SELECTION_SEED,
     Act,
     Evaluation,
@@ -54,7 +55,6 @@ from regil_sb3.td3bc import TD3BC
 
 Learner = TD3BC | BAKU
 
-METHODS = ("policy", "best_policy", "guide", "corrected_guide", "bc", "vinn")  # evaluated
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
 
 
@@ -330,7 +330,7 @@ def _bc_model(settings: Settings, demo: Demonstration, env: VecEnv, run: Path, t
 
 
 def evaluate_run(
-    run: Path, episodes: int, trust: bool = False, only: Sequence[str] = METHODS
+    run: Path, episodes: int, trust: bool = False, only: Collection[str] = tuple(METHODS)
 ) -> dict[str, Any]:
     """Evaluate a run's last and best model, both guides and BC, and write ``evaluation.json``.
 

@@ -14,6 +14,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
 from regil_sb3.envs import EVALUATION_SEEDS, LIBERO_TASKS
+from regil_sb3.envs.choices import check_choices, check_positive
 from regil_sb3.envs.libero_experts import Action, make_expert
 from regil_sb3.envs.libero_import import bddl_file, import_libero, initial_states
 from regil_sb3.envs.rendering import Renderer, prepare_graphics
@@ -102,21 +103,11 @@ class LiberoEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle):
         if task not in LIBERO_TASKS:
             near = difflib.get_close_matches(task, LIBERO_TASKS, cutoff=0.3) or list(LIBERO_TASKS)
             raise ValueError(f"task {task!r} is not one of LIBERO's: try {', '.join(near[:3])}")
-        if obs not in ("pixels", "state"):
-            raise ValueError(f"obs {obs!r} must be 'pixels' or 'state'")
-        if camera not in CAMERAS:
-            raise ValueError(f"camera {camera!r} is not one of {', '.join(CAMERAS)}")
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode {render_mode!r} must be 'rgb_array' or None")
         render_size = size if render_size is None else render_size
-        for name, value in (
-            ("size", size),
-            ("action_repeat", action_repeat),
-            ("render_size", render_size),
-            ("max_steps", max_steps),
-        ):
-            if value < 1:
-                raise ValueError(f"{name} {value!r} must be at least 1")
+        check_choices(obs, camera, CAMERAS, render_mode)
+        check_positive(
+            size=size, action_repeat=action_repeat, render_size=render_size, max_steps=max_steps
+        )
         prepare_graphics()
         self._sim = _make_simulation(*LIBERO_TASKS[task])
         self._states = initial_states(*LIBERO_TASKS[task])

@@ -17,6 +17,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import EzPickle
 
 from regil_sb3.envs import METAWORLD_TASKS
+from regil_sb3.envs.choices import check_choices, check_positive
 from regil_sb3.envs.rendering import Renderer, prepare_graphics
 
 __all__ = ["CAMERAS", "MetaWorldEnv"]
@@ -112,21 +113,11 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
         if task not in METAWORLD_TASKS:
             near = difflib.get_close_matches(task, METAWORLD_TASKS) or METAWORLD_TASKS
             raise ValueError(f"task {task!r} is not one of Meta-World's: try {', '.join(near)}")
-        if obs not in ("pixels", "state"):
-            raise ValueError(f"obs {obs!r} must be 'pixels' or 'state'")
-        if camera not in CAMERAS:
-            raise ValueError(f"camera {camera!r} is not one of {', '.join(CAMERAS)}")
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode {render_mode!r} must be 'rgb_array' or None")
         render_size = size if render_size is None else render_size
-        for name, value in (
-            ("size", size),
-            ("action_repeat", action_repeat),
-            ("render_size", render_size),
-            ("max_steps", max_steps),
-        ):
-            if value < 1:
-                raise ValueError(f"{name} {value!r} must be at least 1")
+        check_choices(obs, camera, CAMERAS, render_mode)
+        check_positive(
+            size=size, action_repeat=action_repeat, render_size=render_size, max_steps=max_steps
+        )
         prepare_graphics()
         try:
             from metaworld.env_dict import ENV_CLS_MAP

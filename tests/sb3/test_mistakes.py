@@ -14,22 +14,13 @@ from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalReward
 from regil_wrappers.vector import RetrievalRewardWrapper as VectorReward
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from toy import Reach, demonstration, stacked
+from toy_registered import Drawn
 
 from regil_sb3 import TD3BC
 from regil_sb3.cli import main
 
 TOY = "Mistakes/Reach-v0"
 STATES = "Mistakes/ReachStates-v0"
-
-
-class Drawn(Reach):
-    """The toy, as `gymnasium.make` and SB3 make environments."""
-
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
-
-    def __init__(self, render_mode=None, **kwargs):
-        super().__init__(**kwargs)
-        self.render_mode = render_mode
 
 
 @pytest.fixture(scope="module", autouse=True)
