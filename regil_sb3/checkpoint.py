@@ -8,6 +8,7 @@ A checkpoint executes nothing when it is read: it is JSON and arrays (`regil_sb3
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -93,6 +94,7 @@ class CheckpointCallback(BaseCallback):
             )
         self.generations = Generations(Path(folder), keep, max_bytes)
         self.seconds, self.steps, self.grace, self.log = seconds, steps, grace, log
+        self._process = os.getpid()
         self._told: int | None = None  # the signal that came
         self._saving = False
         self._before: dict[int, Any] = {}  # signals' handlers of others
@@ -161,6 +163,7 @@ class CheckpointCallback(BaseCallback):
             self._pending = []
         self._next = time.monotonic() + self.seconds
         if threading.current_thread() is threading.main_thread():
+            self._process = os.getpid()
             for number in (signal.SIGTERM, signal.SIGINT):
                 self._before[number] = signal.signal(number, self._tell)
 
@@ -210,6 +213,9 @@ class CheckpointCallback(BaseCallback):
 
     def _tell(self, number: int, _: FrameType | None) -> None:
         """A signal came: save at the next step, or else end all the same."""
+        if os.getpid() != self._process:  # an environment's, forked from this one
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
         if self._told is not None:  # a second time
             self._break_off(number, None)
         self._told = number

@@ -670,15 +670,21 @@ class TD3BC(SafeLoad, TD3):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfTD3BC:
-        """Learn for ``total_timesteps`` transitions, all environments and the warm-up counted."""
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        """Learn for ``total_timesteps`` transitions, all environments and the warm-up counted.
+
+        However it ends, callbacks that have a ``close`` are closed.
+        """
+        try:
+            return super().learn(
+                total_timesteps=total_timesteps,
+                callback=callback,
+                log_interval=log_interval,
+                tb_log_name=tb_log_name,
+                reset_num_timesteps=reset_num_timesteps,
+                progress_bar=progress_bar,
+            )
+        finally:  # Stable-Baselines3 tells callbacks of the end only where no error was raised
+            _close(callback)
 
     def _excluded_save_params(self) -> list[str]:
         return [
@@ -703,3 +709,11 @@ def q_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> tuple[th.T
     """Q of every critic, (B, 1) each."""
     inputs = th.cat([features, actions], dim=1)
     return tuple(q(inputs) for q in critic.q_networks)
+
+
+def _close(callback: MaybeCallback) -> None:
+    """Close a callback, and those in it, that can be."""
+    for inner in callback if isinstance(callback, list) else getattr(callback, "callbacks", []):
+        _close(inner)
+    if hasattr(callback, "close"):
+        callback.close()

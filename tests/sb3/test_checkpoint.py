@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import doctest
 import errno
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from toy import Reach, demonstration
 
@@ -195,13 +197,33 @@ def test_told_to_end_it_saves_the_step_under_way(number, ends, tmp_path):
     checkpoints = CheckpointCallback(tmp_path)
     model = new_model(toy())
     with pytest.raises(ends) as told:
-        model.learn(STEPS, [checkpoints, Tell()])
-    checkpoints.close()
+        model.learn(STEPS, CallbackList([checkpoints, Tell()]))
     assert signal.getsignal(number) is before
     if ends is Preempted:
         assert told.value.code == 75
     again = new_model(toy())
     assert CheckpointCallback(tmp_path).restore(again) == 90
+
+
+def test_forked_processes_end_when_told(tmp_path):
+    """Those of environments, as a vector environment starts them, inherit the handlers."""
+
+    class Fork(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 20:
+                here, there = multiprocessing.Pipe()
+                context = multiprocessing.get_context("fork")
+                child = context.Process(target=lambda: (there.send(1), time.sleep(60)))
+                child.start()
+                here.recv()  # Python forgets a signal that comes while it forks
+                child.terminate()
+                child.join(30)
+                self.exitcode = child.exitcode
+            return True
+
+    fork = Fork()
+    new_model(toy()).learn(40, [CheckpointCallback(tmp_path), fork])
+    assert fork.exitcode == -signal.SIGTERM
 
 
 def test_a_full_disk_is_named_and_training_goes_on(tmp_path, monkeypatch):
@@ -232,7 +254,6 @@ def test_what_takes_too_long_is_broken_off(tmp_path):
     checkpoints = CheckpointCallback(tmp_path, steps=40, grace=0.2)
     with pytest.raises(Preempted):
         new_model(toy()).learn(STEPS, [checkpoints, Hang()])
-    checkpoints.close()
     assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 80
 
 
