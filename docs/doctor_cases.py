@@ -13,7 +13,7 @@ import numpy as np
 from regil_wrappers import Demonstration
 
 from regil_sb3 import doctor
-from regil_sb3.findings import status
+from regil_sb3.doctor.findings import status
 from regil_sb3.recording import record_expert
 
 ENV = "regil/metaworld-button-press-v0"

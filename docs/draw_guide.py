@@ -14,8 +14,8 @@ from matplotlib import pyplot as plt
 from regil_wrappers import RetrievalGuideWrapper
 
 import regil_sb3  # registers the environments  # noqa: F401
-from regil_sb3.guide_view import guide_view
 from regil_sb3.recording import EVALUATION_SEEDS, record_expert
+from regil_sb3.report.guide_view import guide_view
 
 TASKS = ("button-press", "hammer", "plate-slide")
 ORANGE, BLUE = "#ff9c5a", "#6cabff"

@@ -284,7 +284,7 @@ def _train(args: argparse.Namespace) -> None:
     from regil_wrappers import Demonstration
 
     from regil_sb3 import process, training
-    from regil_sb3.checkpoint import Preempted
+    from regil_sb3.checkpoint.callback import Preempted
     from regil_sb3.robots.interfaces import RobotError
     from regil_sb3.run_folder import checkpoints_of, refuse_finished
     from regil_sb3.settings import encoder_size, make_settings
@@ -356,7 +356,7 @@ def _report(runs: list[Path], out: Path | None) -> None:
 
         print(f"report: {write_report(runs[0], out)}")
         return
-    from regil_sb3.comparison import write_comparison
+    from regil_sb3.report import write_comparison
 
     out = out or runs[0].resolve().parent / "comparison.html"
     print(f"comparison: {write_comparison(runs, out)}")
@@ -407,11 +407,11 @@ def main(argv: list[str] | None = None) -> int:
         elif args.command == "push":
             _push(args.run, args.repo, args.private)
         elif args.command == "bench":
-            from regil_sb3 import bench
+            from regil_sb3.bench import tables
 
             own = ("command", "table")
             given = {n: v for n, v in vars(args).items() if n not in own and v is not None}
-            bench.main(args.table, **given)
+            tables.main(args.table, **given)
     except KeyboardInterrupt:
         return 130
     except (

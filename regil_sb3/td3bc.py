@@ -715,5 +715,6 @@ def _close(callback: MaybeCallback) -> None:
     """Close a callback, and those in it, that can be."""
     for inner in callback if isinstance(callback, list) else getattr(callback, "callbacks", []):
         _close(inner)
-    if hasattr(callback, "close"):
-        callback.close()
+    close = getattr(callback, "close", None)
+    if close is not None:
+        close()

@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 from tqdm import tqdm
 
 from regil_sb3.baselines import BAKU, BC, Offline, vinn_act
-from regil_sb3.checkpoint import CheckpointCallback
+from regil_sb3.checkpoint import CheckpointCallback, ReplayableEpisode
 from regil_sb3.evaluation import (
     EVALUATION_SEED,
     METHODS,
@@ -37,7 +37,7 @@ from regil_sb3.evaluation import (
     policy_act,
 )
 from regil_sb3.files import replacing
-from regil_sb3.open_episode import ReplayableEpisode
+from regil_sb3.report.success_films import save_films
 from regil_sb3.run_folder import (
     AppendingCSV,
     best_so_far,
@@ -50,7 +50,6 @@ from regil_sb3.run_folder import (
     save_model,
 )
 from regil_sb3.settings import ALGOS, Settings
-from regil_sb3.success_films import save_films
 from regil_sb3.td3bc import TD3BC
 
 Learner = TD3BC | BAKU

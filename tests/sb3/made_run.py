@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 from regil_wrappers import Demonstration
 
+from regil_sb3.report.success_films import save_films
 from regil_sb3.success_buffer import SuccessBuffer
-from regil_sb3.success_films import save_films
 
 
 def film(length, tint, **metadata):

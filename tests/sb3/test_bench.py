@@ -2,10 +2,10 @@
 
 import pytest
 
-from regil_sb3 import bench
+from regil_sb3.bench import tables
 
 
-@pytest.mark.parametrize("table", [bench.rendering, bench.retrieval])
+@pytest.mark.parametrize("table", [tables.rendering, tables.retrieval])
 def test_both_sides_are_timed(table):
     ours, peer = table(blocks=2, steps=5)
     assert ours.ratio == 1
@@ -14,9 +14,9 @@ def test_both_sides_are_timed(table):
 
 
 def test_table_is_printed(monkeypatch, capsys):
-    rows = [bench.Row("ours", 0.5, 1.0), bench.Row("theirs", 2.0, 4.0)]
-    monkeypatch.setitem(bench.TABLES, "retrieval", lambda: rows)
-    assert bench.main("retrieval") == rows
+    rows = [tables.Row("ours", 0.5, 1.0), tables.Row("theirs", 2.0, 4.0)]
+    monkeypatch.setitem(tables.TABLES, "retrieval", lambda: rows)
+    assert tables.main("retrieval") == rows
     assert capsys.readouterr().out.splitlines()[-1].split() == ["theirs", "2.000", "4.00"]
 
 
@@ -26,6 +26,6 @@ def test_unknown_table_gets_one_line():
         match=r"^table 'speed' is not one of rendering, retrieval, ranking, guide, success-buffer, "
         r"latency, memory, index, throughput$",
     ):
-        bench.main("speed")
+        tables.main("speed")
     with pytest.raises(ValueError, match=r"^the table 'retrieval' has no option --steps$"):
-        bench.main("retrieval", steps=3)
+        tables.main("retrieval", steps=3)

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from regil_sb3 import bench, bench_guide
-from regil_sb3.bench_guide import DISTURBANCES, Guided
+from regil_sb3.bench import guide, tables
+from regil_sb3.bench.guide import DISTURBANCES, Guided
 from regil_sb3.cli import main
 
 
 def test_table_means_over_each_disturbance():
     one = Guided("hammer", 0, "none", [False, True], [True, True], [1.0, 3.0], 0.25, 125)
-    lines = bench_guide.table(
+    lines = guide.table(
         [
             one,
             replace(one, seed=1, plain=[False] * 2, corrected=[True, False], errors_cm=[]),
@@ -29,9 +29,7 @@ def test_table_means_over_each_disturbance():
 
 
 def test_corrected_replay_of_one_task():
-    first, second = (
-        next(bench_guide.guide(["button-press"], episodes=3, seeds=[0])) for _ in range(2)
-    )
+    first, second = (next(guide.guide(["button-press"], episodes=3, seeds=[0])) for _ in range(2))
     assert replace(first, seconds=0.0) == replace(second, seconds=0.0)
     assert len(first.plain) == len(first.corrected) == 3
     assert sum(first.corrected) > sum(first.plain)
@@ -54,7 +52,7 @@ def test_success_buffer_is_printed(capsys):
 
 def test_disturbances_change_pictures_and_repeat_themselves():
     def frames(name):
-        env = bench_guide._make("button-press", name)
+        env = guide._make("button-press", name)
         first = env.reset(seed=5)[0]
         later = env.step(np.zeros(4, np.float32))[0]
         again = env.reset(seed=5)[0]
@@ -101,6 +99,6 @@ def test_bad_options_get_one_line(command, message, capsys):
 
 def test_it_is_reached_by_name(monkeypatch):
     calls = []
-    monkeypatch.setattr(bench_guide, "main", lambda *a, **k: calls.append((a, k)))
-    assert bench.main("guide", tasks=["hammer"]) == []
+    monkeypatch.setattr(guide, "main", lambda *a, **k: calls.append((a, k)))
+    assert tables.main("guide", tasks=["hammer"]) == []
     assert calls == [(("guide",), {"tasks": ["hammer"]})]

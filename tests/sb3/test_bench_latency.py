@@ -12,9 +12,9 @@ from regil_wrappers.alignment import (
     warping_path,
 )
 
-from regil_sb3 import bench, bench_latency, machine
+from regil_sb3.bench import latency, machine, tables
+from regil_sb3.bench.peers import LIBROSA_ON_COSTS, PEERS
 from regil_sb3.cli import main
-from regil_sb3.peers import LIBROSA_ON_COSTS, PEERS
 
 OURS = [
     "1 environment",
@@ -42,7 +42,7 @@ def test_all_find_the_same_segment():
 
 
 def test_every_side_of_every_length_is_a_row():
-    rows = list(bench_latency.latency(["pixels?size=6"], [9, 40], 3, 4, seconds=1e9))
+    rows = list(latency.latency(["pixels?size=6"], [9, 40], 3, 4, seconds=1e9))
     names = [*OURS[:3], *(peer.name for peer in PEERS), OURS[3], LIBROSA_ON_COSTS.name]
     assert [(row.frames, row.what) for row in rows] == [(n, w) for n in (9, 40) for w in names]
     for row in rows:
@@ -69,8 +69,8 @@ def test_ratios_are_of_what_they_are_compared_with(monkeypatch):
     def turns(sides, blocks, steps, seconds):
         return {name: np.array([taken[name]] * 3) for name in sides}
 
-    monkeypatch.setattr(bench_latency, "_taking_turns", turns)
-    rows = {row.what: row for row in bench_latency.latency(["pixels"], [9], blocks=1, steps=1)}
+    monkeypatch.setattr(latency, "_taking_turns", turns)
+    rows = {row.what: row for row in latency.latency(["pixels"], [9], blocks=1, steps=1)}
     assert (rows[OURS[0]].search, rows[OURS[0]].total) == (3, 7)
     assert rows[OURS[2]].ratio == pytest.approx(2.5)  # 50 / 20
     assert [rows[peer.name].ratio for peer in PEERS] == pytest.approx([2, 4, 6])  # of 7 - 2
@@ -83,7 +83,7 @@ def test_a_slow_side_gives_its_turn_back():
         "fast": lambda block, step: (0, 0, 0, 0.0),
         "absent": "not installed",
     }
-    times = bench_latency._taking_turns(sides, blocks=2, steps=5, seconds=0.5)
+    times = latency._taking_turns(sides, blocks=2, steps=5, seconds=0.5)
     assert {name: len(rows) for name, rows in times.items()} == {"slow": 4, "fast": 10}
 
 
@@ -91,10 +91,10 @@ def test_what_is_not_installed_is_a_row_that_says_so(monkeypatch, capsys):
     for name in ("librosa.sequence", "timm"):
         monkeypatch.setitem(sys.modules, name, None)
     peers = [replace(peer, module="no_such_package") for peer in PEERS[:2]]
-    monkeypatch.setattr(bench_latency, "PEERS", (*peers, PEERS[2]))
+    monkeypatch.setattr(latency, "PEERS", (*peers, PEERS[2]))
     encoders = ["efficientnet-lite0?size=32", "pixels?size=6"]
-    real = bench_latency.latency
-    monkeypatch.setattr(bench_latency, "latency", lambda **o: real(**o, blocks=1, steps=1))
+    real = latency.latency
+    monkeypatch.setattr(latency, "latency", lambda **o: real(**o, blocks=1, steps=1))
     assert main(["bench", "latency", "--encoders", *encoders, "--frames", "9"]) == 0
     lines = capsys.readouterr().out.splitlines()
     missing = [line for line in lines if "pip install" in line]
@@ -121,7 +121,7 @@ def test_bad_options_get_one_line(words, message, capsys):
 
 def test_retrieval_has_no_encoders():
     with pytest.raises(ValueError, match="the table 'retrieval' has no option --encoders"):
-        bench.main("retrieval", encoders=["pixels"])
+        tables.main("retrieval", encoders=["pixels"])
 
 
 def test_the_machine_in_one_line(monkeypatch):

@@ -6,15 +6,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from regil_wrappers import memory
+from regil_wrappers import memory as retrieval_memory
 
-from regil_sb3 import bench_memory
+from regil_sb3.bench import memory
 from regil_sb3.cli import main
 
 
 def test_each_picture_is_found_where_it_is():
-    pictures = bench_memory.Pictures(dims=8)
-    frames = bench_memory._numbered(70, 1000).frames
+    pictures = memory.Pictures(dims=8)
+    frames = memory._numbered(70, 1000).frames
     rows = pictures.encode(frames)
     np.testing.assert_array_equal(rows, pictures.demonstration(70))
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, rtol=1e-6)
@@ -22,7 +22,7 @@ def test_each_picture_is_found_where_it_is():
 
 
 def test_both_searches_of_a_small_memory_agree():
-    exact, near = bench_memory.measure(1_200, dims=8)  # 30 cells, of which 16 are looked into
+    exact, near = memory.measure(1_200, dims=8)  # 30 cells, of which 16 are looked into
     assert (exact.frames, exact.demonstrations, exact.search) == (1_200, 2, "exact")
     assert (near.frames, near.demonstrations, near.search) == (1_200, 2, "faiss")
     assert exact.recall == exact.same == 1
@@ -35,19 +35,19 @@ def test_both_searches_of_a_small_memory_agree():
 
 
 def test_a_search_that_misses_neighbours_is_seen(monkeypatch):
-    monkeypatch.setattr(memory, "_PROBED", 1)
-    _, near = bench_memory.measure(2_000, dims=8)
+    monkeypatch.setattr(retrieval_memory, "_PROBED", 1)
+    _, near = memory.measure(2_000, dims=8)
     assert near.recall < 0.99
 
 
 def test_growth_is_the_slope():
-    row = bench_memory.Row(0, 0, "exact", 0, 0, 0, 0, 1, 1, 0, 0)
+    row = memory.Row(0, 0, "exact", 0, 0, 0, 0, 1, 1, 0, 0)
     rows = [replace(row, frames=10**n, step=3.0 * 10**n) for n in (3, 4, 5)]
     rows += [
         replace(row, frames=10**n, step=s, search="faiss") for n, s in ((3, 1), (4, 1), (5, 10))
     ]
-    assert bench_memory.growth(rows, "exact") == pytest.approx((1, 1))
-    assert bench_memory.growth(rows, "faiss") == pytest.approx((0.5, 1))
+    assert memory.growth(rows, "exact") == pytest.approx((1, 1))
+    assert memory.growth(rows, "faiss") == pytest.approx((0.5, 1))
 
 
 def test_table_and_picture(tmp_path, capsys):
@@ -87,7 +87,7 @@ def test_kinds_of_index(capsys):
 )
 def test_what_does_not_fit_is_refused_in_one_line(words, message, monkeypatch, capsys):
     free = SimpleNamespace(available=10**9, total=2 * 10**9)
-    monkeypatch.setattr(bench_memory.psutil, "virtual_memory", lambda: free)
+    monkeypatch.setattr(memory.psutil, "virtual_memory", lambda: free)
     assert main(["bench", *words]) == 2
     error = capsys.readouterr().err
     assert message in error

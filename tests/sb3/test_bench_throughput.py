@@ -2,11 +2,11 @@
 
 import pytest
 
-from regil_sb3 import bench_throughput
+from regil_sb3.bench import throughput
 
 
 def test_every_algorithm_learns_and_its_parts_add_up():
-    rows = bench_throughput.throughput(blocks=1, steps=6, starts=4)
+    rows = throughput.throughput(blocks=1, steps=6, starts=4)
     assert [row.what for row in rows] == ["SB3 TD3", "SB3 SAC", "TD3BC"]
     assert rows[0].ratio == 1
     for row in rows:
@@ -16,9 +16,9 @@ def test_every_algorithm_learns_and_its_parts_add_up():
 
 
 def test_table_is_printed(monkeypatch, capsys):
-    rows = [bench_throughput.Row("SB3 TD3", 20.0, 1.0, 11.0, 1.0, 36.0, 2.0)]
-    monkeypatch.setattr(bench_throughput, "throughput", lambda: rows)
-    bench_throughput.main()
+    rows = [throughput.Row("SB3 TD3", 20.0, 1.0, 11.0, 1.0, 36.0, 2.0)]
+    monkeypatch.setattr(throughput, "throughput", lambda: rows)
+    throughput.main()
     assert capsys.readouterr().out.splitlines()[-1] == (
         "| SB3 TD3 | 20.0 | 1.00 | 11.00 | 1.00 | 36.00 | 2.00 |"
     )

@@ -10,8 +10,8 @@ from pathlib import Path
 import made_run
 import pytest
 
-from regil_sb3.comparison import write_comparison
-from regil_sb3.report import write_report
+from regil_sb3.report.comparison import write_comparison
+from regil_sb3.report.run_page import write_report
 
 pytestmark = pytest.mark.browser
 

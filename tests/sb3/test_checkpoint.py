@@ -21,9 +21,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from toy import Reach, demonstration
 
 from regil_sb3 import TD3BC, checkpoint, open_episode
-from regil_sb3.checkpoint import CheckpointCallback, Preempted
-from regil_sb3.learner_state import learner_state
-from regil_sb3.open_episode import ReplayableEpisode
+from regil_sb3.checkpoint import CheckpointCallback, Preempted, ReplayableEpisode
+from regil_sb3.checkpoint.learner_state import learner_state
 
 STEPS = 200
 

@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from regil_sb3.cli import main
-from regil_sb3.comparison import methods, write_comparison
 from regil_sb3.intervals import improvement, iqm, wilson
-from regil_sb3.run_contents import read_run
+from regil_sb3.report.comparison import methods, write_comparison
+from regil_sb3.report.run_contents import read_run
 
 OTHER = "regil/metaworld-hammer-v0"
 

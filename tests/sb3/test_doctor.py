@@ -13,10 +13,10 @@ from regil_wrappers import Demonstration, make_encoder
 
 from regil_sb3 import doctor
 from regil_sb3.cli import main
-from regil_sb3.doctor_episodes import Played, check_guide
-from regil_sb3.doctor_pictures import check_actions, check_motion, check_recorded
-from regil_sb3.doctor_rewards import Reward, check_reward, judged
-from regil_sb3.findings import Finding, status, table
+from regil_sb3.doctor.episodes import Played, check_guide
+from regil_sb3.doctor.findings import Finding, status, table
+from regil_sb3.doctor.pictures import check_actions, check_motion, check_recorded
+from regil_sb3.doctor.rewards import Reward, check_reward, judged
 from regil_sb3.settings import make_settings
 
 ENV = "ToyCamera-v0"

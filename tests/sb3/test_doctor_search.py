@@ -11,7 +11,7 @@ from regil_wrappers.encoders import encoders_at_hand, registry
 
 from regil_sb3 import doctor
 from regil_sb3.cli import main
-from regil_sb3.doctor_search import candidates
+from regil_sb3.doctor.search import candidates
 from regil_sb3.settings import make_settings
 
 ENV = "ToyCamera-v0"

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch as th
 
-from regil_sb3 import generations
-from regil_sb3.generations import Generations
-from regil_sb3.snapshot import Ring
+from regil_sb3.checkpoint import generations
+from regil_sb3.checkpoint.generations import Generations
+from regil_sb3.checkpoint.snapshot import Ring
 
 ROWS = 40
 

@@ -9,8 +9,8 @@ import pytest
 import toy_camera
 from regil_wrappers import RetrievalGuideWrapper
 
-from regil_sb3.guide_view import guide_picture, guide_view
-from regil_sb3.report import write_report
+from regil_sb3.report.guide_view import guide_picture, guide_view
+from regil_sb3.report.run_page import write_report
 
 
 def calibrate(task):

@@ -118,8 +118,8 @@ def test_distributions_hold_the_data_files_and_no_tests(dist):
         names = _inside(path)
         assert names >= {
             "regil_sb3/py.typed",
-            "regil_sb3/report.html",
-            "regil_sb3/report.py",
+            "regil_sb3/report/page.html",
+            "regil_sb3/report/run_page.py",
             "regil_sb3/envs/__init__.py",
             *(f"regil_sb3/{name}" if wheel else name for name in configs),
         }

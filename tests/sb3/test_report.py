@@ -13,13 +13,13 @@ import yaml
 from made_run import buffer_of, film
 from regil_wrappers import Demonstration
 
-from regil_sb3 import report
-from regil_sb3.charts import Line, line_chart
-from regil_sb3.episode_alignment import align
-from regil_sb3.page import flat
-from regil_sb3.report import write_report
+from regil_sb3.report import run_page
+from regil_sb3.report.charts import Line, line_chart
+from regil_sb3.report.episode_alignment import align
+from regil_sb3.report.page import flat
+from regil_sb3.report.run_page import write_report
+from regil_sb3.report.success_films import load_films, save_films
 from regil_sb3.success_buffer import SuccessBuffer
-from regil_sb3.success_films import load_films, save_films
 
 EVIL = "</script><script>alert('x')</script>&\"'"
 
@@ -268,9 +268,9 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path):
 
 def test_guided_stretches_are_joined():
     rows = [{"time/total_timesteps": s, "time/guided": g} for s, g in ((10, 1), (20, 1), (30, 0))]
-    assert report._guided(rows) == [(0, 20)]
+    assert run_page._guided(rows) == [(0, 20)]
     rows.append({"time/total_timesteps": 40, "time/guided": 1})
-    assert report._guided(rows) == [(0, 20), (30, 40)]
+    assert run_page._guided(rows) == [(0, 20), (30, 40)]
 
 
 def test_nested_settings_become_one_table():

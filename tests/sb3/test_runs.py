@@ -16,9 +16,9 @@ import pyarrow.parquet as parquet
 import pytest
 from toy import demonstration
 
-from regil_sb3 import bench_runs
+from regil_sb3.bench import run_tables
+from regil_sb3.bench.runs import Run, finish_all, predicted_hours, seconds_of
 from regil_sb3.cli import main
-from regil_sb3.runs import Run, finish_all, predicted_hours, seconds_of
 
 TINY = (
     "warmup_steps=60",
@@ -84,13 +84,13 @@ def test_tables_are_what_evaluations_say(tmp_path):
         done("hammer", "RL", 0, no, None),
         Run(str(tmp_path), "regil/metaworld-hammer-v0", "RL", 1, 15_000, ""),  # not made yet
     ]
-    head, _, ours, rl = bench_runs.table(runs)
+    head, _, ours, rl = run_tables.table(runs)
     assert head.startswith("| method | button-press | hammer | IQM")
     cells = [cell.strip() for cell in ours.strip("|").split("|")]
     assert cells[:3] == ["ReGIL", "0.875 (0.97)", "1.000 (0.91)"]
     assert cells[4:7] == ["3", "10,000", "-"]
     assert [cell.strip() for cell in rl.strip("|").split("|")][:3] == ["RL", "-", "0.000"]
-    assert len(list(bench_runs.raw(runs))) == 16
+    assert len(list(run_tables.raw(runs))) == 16
 
 
 def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
@@ -107,8 +107,8 @@ def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
 
 
 def test_what_is_written(runs, failed, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_runs, "planned", lambda *_, **__: runs[:2])
-    bench_runs.main("ablations", out=str(tmp_path))
+    monkeypatch.setattr(run_tables, "planned", lambda *_, **__: runs[:2])
+    run_tables.main("ablations", out=str(tmp_path))
     rows = parquet.read_table(tmp_path / "ablations.parquet").to_pylist()
     assert len(rows) == 2 * 3
     assert {row["seed"] for row in rows} == {0, 1}
@@ -124,7 +124,7 @@ def test_what_is_written(runs, failed, tmp_path, monkeypatch):
 _BENCH = """
 from pathlib import Path
 from test_runs import toy_run
-from regil_sb3.runs import finish
+from regil_sb3.bench.runs import finish
 finish(toy_run(Path({!r}), steps=600))
 """
 

@@ -13,9 +13,9 @@ import toy_camera
 from regil_wrappers import Demonstration
 
 from regil_sb3.cli import main
-from regil_sb3.devices import Axes, Gamepad, Keyboard, SpaceMouse
 from regil_sb3.recording import Recorder
-from regil_sb3.teleoperation import Session, teleoperate
+from regil_sb3.teleoperation.devices import Axes, Gamepad, Keyboard, SpaceMouse
+from regil_sb3.teleoperation.session import Session, teleoperate
 
 pg = pytest.importorskip("pygame", reason="pygame is not installed")
 
@@ -127,7 +127,7 @@ def test_giving_up_keeps_nothing(tmp_path, monkeypatch, capsys):
     assert played(*TO_HOME, [], press(pg.K_ESCAPE))[0] is None  # in the review
     assert played([])[0] is None  # the window is closed
     pg.display.init()
-    monkeypatch.setattr("regil_sb3.teleop_window.Window.clock", lambda self: Person([]))
+    monkeypatch.setattr("regil_sb3.teleoperation.window.Window.clock", lambda self: Person([]))
     path = tmp_path / "demo.hdf5"
     assert main(["record", ENV, "--teleop", "keyboard", "-o", str(path)]) == 0
     assert "nothing was recorded" in capsys.readouterr().err
@@ -364,7 +364,7 @@ def without_expert():
 
 def test_without_an_expert_a_window_opens(without_expert, tmp_path, monkeypatch, capsys):
     keys = [*hold(pg.K_RIGHT, 3), [], press(pg.K_RETURN)]
-    monkeypatch.setattr("regil_sb3.teleop_window.Window.clock", lambda self: Person(*keys))
+    monkeypatch.setattr("regil_sb3.teleoperation.window.Window.clock", lambda self: Person(*keys))
     path = tmp_path / "new" / "demo.hdf5"
     assert main(["record", without_expert, "-o", str(path)]) == 0
     assert "4 frames, seed 0" in capsys.readouterr().out

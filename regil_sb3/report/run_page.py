@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from regil_sb3.charts import Line, Point, line_chart
-from regil_sb3.episode_alignment import align
-from regil_sb3.guide_view import guide_picture, guide_view
 from regil_sb3.intervals import wilson
-from regil_sb3.page import card, config_table, write_page
-from regil_sb3.pictures import film_player, mosaic
-from regil_sb3.run_contents import STEPS, Rows, column, number, read_run, successes
-from regil_sb3.success_films import SuccessFilms
+from regil_sb3.report.charts import Line, Point, line_chart
+from regil_sb3.report.episode_alignment import align
+from regil_sb3.report.guide_view import guide_picture, guide_view
+from regil_sb3.report.page import card, config_table, write_page
+from regil_sb3.report.pictures import film_player, mosaic
+from regil_sb3.report.run_contents import STEPS, Rows, column, number, read_run, successes
+from regil_sb3.report.success_films import SuccessFilms
 
 __all__ = ["write_report"]
 
@@ -35,8 +35,8 @@ _EXPECTED = ("policy", "guide", "bc")
 def write_report(run: Path | str, out: Path | str | None = None) -> Path:
     """Write a run folder's report: one HTML page that needs no other file and no network.
 
-    Only files are read (`regil_sb3.run_contents`). What is not there yet, or cannot be read, is
-    listed on the page.
+    Only files are read (`regil_sb3.report.run_contents`). What is not there yet, or cannot be read,
+    is listed on the page.
 
     Args:
         run: The run folder that `regil train` wrote, complete or interrupted.

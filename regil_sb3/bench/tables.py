@@ -200,10 +200,10 @@ def main(table: str, **options: Any) -> list[Row]:
     """Measure a table and print it.
 
     Args:
-        table: one of `TABLES`, "ranking" (`regil_sb3.bench_rewards`), "guide" or "success-buffer"
-            (`regil_sb3.bench_guide`), "latency" (`regil_sb3.bench_latency`), "memory" or "index"
-            (`regil_sb3.bench_memory`), "throughput" (`regil_sb3.bench_throughput`), or one of
-            `regil_sb3.bench_runs.LEARNING`.
+        table: one of `TABLES`, "ranking" (`regil_sb3.bench.rewards`), "guide" or "success-buffer"
+            (`regil_sb3.bench.guide`), "latency" (`regil_sb3.bench.latency`), "memory" or "index"
+            (`regil_sb3.bench.memory`), "throughput" (`regil_sb3.bench.throughput`), or one of
+            `regil_sb3.bench.run_tables.LEARNING`.
         **options: the table's own.
 
     Returns:
@@ -213,42 +213,42 @@ def main(table: str, **options: Any) -> list[Row]:
         ValueError: where there is no such table, or it has no such option.
     """
     if table in ("guide", "success-buffer"):
-        from regil_sb3 import bench_guide
+        from regil_sb3.bench import guide
 
-        bench_guide.main(table, **options)
+        guide.main(table, **options)
         return []
-    from regil_sb3 import bench_runs
+    from regil_sb3.bench import run_tables
 
-    if table in bench_runs.LEARNING:
-        known = set(inspect.signature(bench_runs.planned).parameters)
-        known |= set(inspect.signature(bench_runs.main).parameters)
+    if table in run_tables.LEARNING:
+        known = set(inspect.signature(run_tables.planned).parameters)
+        known |= set(inspect.signature(run_tables.main).parameters)
         for name in options:
             if name not in known - {"name", "root", "options"}:
                 raise ValueError(f"the table {table!r} has no option --{name}")
-        bench_runs.main(table, **options)
+        run_tables.main(table, **options)
         return []
     for name in options:
         if name not in _OPTIONS.get(table, ()):
             raise ValueError(f"the table {table!r} has no option --{name}")
     if table == "latency":
-        from regil_sb3 import bench_latency
+        from regil_sb3.bench import latency
 
-        bench_latency.main(**options)
+        latency.main(**options)
         return []
     if table in ("memory", "index"):
-        from regil_sb3 import bench_memory
+        from regil_sb3.bench import memory
 
-        bench_memory.main(table, **options)
+        memory.main(table, **options)
         return []
     if table == "throughput":
-        from regil_sb3 import bench_throughput
+        from regil_sb3.bench import throughput
 
-        bench_throughput.main()
+        throughput.main()
         return []
     if table == "ranking":
-        from regil_sb3 import bench_rewards
+        from regil_sb3.bench import rewards
 
-        bench_rewards.main()
+        rewards.main()
         return []
     if table not in TABLES:
         raise ValueError(f"table {table!r} is not one of {', '.join([*TABLES, *_ROOMS])}")

@@ -1,4 +1,4 @@
-"""All that decides how a run of TD3BC goes on, as one tree of values (`regil_sb3.snapshot`).
+"""All that decides how a run of TD3BC goes on, as one tree of values for `checkpoint.snapshot`.
 
 * ``learner_state``, ``load_learner_state`` - networks, optimisers, buffers, generators, counters,
   and the episodes under way
@@ -17,6 +17,7 @@ import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
+from regil_sb3.checkpoint.snapshot import Ring
 from regil_sb3.relabelling import (
     EpisodeRewardDictReplayBuffer,
     EpisodeRewardNStepReplayBuffer,
@@ -24,7 +25,6 @@ from regil_sb3.relabelling import (
     EpisodeRewards,
 )
 from regil_sb3.replay_buffer import FrameReplayBuffer
-from regil_sb3.snapshot import Ring
 from regil_sb3.td3bc import TD3BC
 
 __all__ = ["check_can_be_kept", "learner_state", "load_learner_state"]
@@ -263,7 +263,7 @@ def _load_environments_state(env: VecEnv, state: dict[str, Any]) -> list[str]:
         env.set_attr("np_random", fresh, indices=i)
         if lasting is not None:
             env.env_method("set_lasting_state", lasting, indices=i)
-    return ["its environment is no ReplayableEpisode (regil_sb3.open_episode)"]
+    return ["its environment is no ReplayableEpisode (regil_sb3.checkpoint.open_episode)"]
 
 
 def _replay(env: VecEnv, i: int, episode: dict[str, Any]) -> str:

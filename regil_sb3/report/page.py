@@ -34,7 +34,7 @@ def write_page(
     """
     lines = "".join(f"<li>{html.escape(line)}</li>" for line in missing)
     warned = f'<div class="card missing"><b>Missing from this page</b><ul>{lines}</ul></div>'
-    page = Template(files("regil_sb3").joinpath("report.html").read_text("utf-8")).substitute(
+    page = Template(files("regil_sb3.report").joinpath("page.html").read_text("utf-8")).substitute(
         title=html.escape(title),
         headline=headline,
         missing=warned if missing else "",

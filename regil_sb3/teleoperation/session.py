@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration
 
-from regil_sb3.devices import Axes, Command, Device, make_device
 from regil_sb3.recording import Recorder, check_seeds, make_env
-from regil_sb3.teleop_window import Window
+from regil_sb3.teleoperation.devices import Axes, Command, Device, make_device
+from regil_sb3.teleoperation.window import Window
 
 __all__ = ["Clock", "Session", "teleoperate"]
 

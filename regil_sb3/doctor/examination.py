@@ -26,9 +26,10 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 import regil_sb3  # registers the environments  # noqa: F401
 from regil_sb3.as_seen import as_seen
-from regil_sb3.doctor_episodes import Act, Played, check_guide, check_replay, play
-from regil_sb3.doctor_page import write_page
-from regil_sb3.doctor_pictures import (
+from regil_sb3.doctor.episodes import Act, Played, check_guide, check_replay, play
+from regil_sb3.doctor.findings import Finding, listed, status, table
+from regil_sb3.doctor.page import write_page
+from regil_sb3.doctor.pictures import (
     check_actions,
     check_motion,
     check_pictures,
@@ -36,10 +37,9 @@ from regil_sb3.doctor_pictures import (
     check_scene,
     said_of,
 )
-from regil_sb3.doctor_rewards import Reward, check_reward, judged, played_demonstration, signals
-from regil_sb3.doctor_search import Filmed, candidates, search
+from regil_sb3.doctor.rewards import Reward, check_reward, judged, played_demonstration, signals
+from regil_sb3.doctor.search import Filmed, candidates, search
 from regil_sb3.evaluation import SELECTION_SEED
-from regil_sb3.findings import Finding, listed, status, table
 from regil_sb3.replay_buffer import frame_bytes
 from regil_sb3.settings import RETRIEVAL, Settings, make_settings
 from regil_sb3.td3bc import TD3BC

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from regil_wrappers import Demonstration
 from regil_wrappers.reward_signals import Signal
 
-from regil_sb3.doctor_pictures import is_idle
-from regil_sb3.findings import Finding, listed
+from regil_sb3.doctor.findings import Finding, listed
+from regil_sb3.doctor.pictures import is_idle
 
 __all__ = ["Act", "Played", "check_guide", "check_replay", "play"]
 

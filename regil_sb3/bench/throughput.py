@@ -23,11 +23,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 from tqdm import tqdm
 
+from regil_sb3.bench.timing import Timed
 from regil_sb3.policies import ConvEncoder
 from regil_sb3.recording import record_expert
 from regil_sb3.settings import Settings, make_settings
 from regil_sb3.td3bc import TD3BC
-from regil_sb3.timing import Timed
 
 __all__ = ["Row", "main", "throughput"]
 

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import psutil
 
+from regil_sb3.checkpoint.snapshot import Array, Ring, put_together, take_apart
 from regil_sb3.files import sync_folder, write_durably
-from regil_sb3.snapshot import Array, Ring, put_together, take_apart
 
 __all__ = ["Generations"]
 
@@ -32,7 +32,7 @@ _DAMAGE = (ValueError, OSError, KeyError, TypeError, IndexError, RecursionError,
 
 
 class Generations:
-    """Saves trees of values (`regil_sb3.snapshot`), and loads the newest that is whole.
+    """Saves trees of values (`regil_sb3.checkpoint.snapshot`), and loads the newest that is whole.
 
     Args:
         folder: made when the first is saved.

@@ -21,9 +21,9 @@ from regil_wrappers.frames import FrameSource
 from regil_wrappers.registration import moved_back, register
 from regil_wrappers.reward_signals import make_signal
 
-from regil_sb3.doctor_episodes import Played
-from regil_sb3.doctor_rewards import Reward, judged
-from regil_sb3.findings import Finding, listed
+from regil_sb3.doctor.episodes import Played
+from regil_sb3.doctor.findings import Finding, listed
+from regil_sb3.doctor.rewards import Reward, judged
 from regil_sb3.settings import Settings
 
 __all__ = ["Filmed", "Setting", "candidates", "search"]

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration
 
-from regil_sb3.charts import Line, line_chart
-from regil_sb3.episode_alignment import AlignedEpisode
+from regil_sb3.report.charts import Line, line_chart
+from regil_sb3.report.episode_alignment import AlignedEpisode
 
 __all__ = ["data_uri", "film_player", "mosaic"]
 

@@ -3,7 +3,8 @@
 * ``CheckpointCallback`` - saves now and then, and when the process is told to end
 * ``Preempted`` - ends a process that was told to: exit status 75, "try again"
 
-A checkpoint executes nothing when it is read: it is JSON and arrays (`regil_sb3.generations`).
+A checkpoint executes nothing when it is read: it is JSON and arrays
+(`regil_sb3.checkpoint.generations`).
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from regil_sb3.generations import Generations
-from regil_sb3.learner_state import check_can_be_kept, learner_state, load_learner_state
+from regil_sb3.checkpoint.generations import Generations
+from regil_sb3.checkpoint.learner_state import check_can_be_kept, learner_state, load_learner_state
 from regil_sb3.td3bc import TD3BC
 
 __all__ = ["CheckpointCallback", "Preempted"]

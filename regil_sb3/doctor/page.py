@@ -11,9 +11,9 @@ from pathlib import Path
 
 from regil_wrappers import Demonstration
 
-from regil_sb3 import page
-from regil_sb3.findings import Finding
-from regil_sb3.pictures import data_uri, film_player
+from regil_sb3.doctor.findings import Finding
+from regil_sb3.report import page
+from regil_sb3.report.pictures import data_uri, film_player
 
 __all__ = ["write_page"]
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from regil_sb3.devices import Command, import_pygame
 from regil_sb3.recording import Recorder
+from regil_sb3.teleoperation.devices import Command, import_pygame
 
 __all__ = ["Window"]
 

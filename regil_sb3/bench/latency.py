@@ -21,8 +21,9 @@ from regil_wrappers.encoders import Encoder, make_encoder
 from regil_wrappers.latency import Latency
 from regil_wrappers.retrieval import step_together
 
-from regil_sb3 import machine, process
-from regil_sb3.peers import LIBROSA_ON_COSTS, PEERS, Peer
+from regil_sb3 import process
+from regil_sb3.bench import machine
+from regil_sb3.bench.peers import LIBROSA_ON_COSTS, PEERS, Peer
 
 __all__ = ["ENCODERS", "FRAMES", "Row", "latency", "main", "table"]
 

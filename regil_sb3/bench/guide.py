@@ -19,11 +19,11 @@ import numpy.typing as npt
 from regil_wrappers import Demonstration, RetrievalGuideWrapper
 
 import regil_sb3  # registers the environments  # noqa: F401
-from regil_sb3.bench_rewards import TASKS
+from regil_sb3.bench.rewards import TASKS
+from regil_sb3.bench.timing import Timed
 from regil_sb3.envs import METAWORLD_TASKS
 from regil_sb3.recording import EVALUATION_SEEDS, record_expert
 from regil_sb3.settings import make_settings, presets
-from regil_sb3.timing import Timed
 
 __all__ = ["DISTURBANCES", "Collected", "Guided", "guide", "main", "success_buffer", "table"]
 

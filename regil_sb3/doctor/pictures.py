@@ -23,7 +23,7 @@ from regil_wrappers.guide_arguments import fitting_actions
 from regil_wrappers.registration import register
 from regil_wrappers.rewards import arc_length
 
-from regil_sb3.findings import Finding, Picture
+from regil_sb3.doctor.findings import Finding, Picture
 
 __all__ = [
     "check_actions",

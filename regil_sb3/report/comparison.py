@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from regil_sb3.charts import Line, line_chart
 from regil_sb3.intervals import Interval, improvement, iqm, wilson
-from regil_sb3.page import card, flat, write_page
-from regil_sb3.run_contents import RunContents, column, number, read_run, successes
+from regil_sb3.report.charts import Line, line_chart
+from regil_sb3.report.page import card, flat, write_page
+from regil_sb3.report.run_contents import RunContents, column, number, read_run, successes
 
 __all__ = ["methods", "write_comparison"]
 

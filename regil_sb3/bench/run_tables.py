@@ -1,8 +1,8 @@
 """`regil bench ablations` and its like: methods that learn, on the same tasks and unseen seeds.
 
-Each run is kept and never made twice; a bench that was stopped goes on (`regil_sb3.runs`). What is
-printed is made from the run folders alone: success of the last policy with intervals, the paper's
-figures beside it, and the steps to .8 and .95.
+Each run is kept and never made twice; a bench that was stopped goes on (`regil_sb3.bench.runs`).
+What is printed is made from the run folders alone: success of the last policy with intervals, the
+paper's figures beside it, and the steps to .8 and .95.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from regil_sb3.bench.machine import describe
+from regil_sb3.bench.runs import Run, finish_all, predicted_hours, seconds_of
 from regil_sb3.intervals import Interval, iqm
-from regil_sb3.machine import describe
-from regil_sb3.runs import Run, finish_all, predicted_hours, seconds_of
 
 __all__ = ["LEARNING", "main", "planned", "raw", "table"]
 

@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 from regil_wrappers import Demonstration
 
-from regil_sb3.success_films import SuccessFilms, load_films
+from regil_sb3.report.success_films import SuccessFilms, load_films
 
 __all__ = ["STEPS", "Rows", "RunContents", "column", "number", "read_run", "successes"]
 

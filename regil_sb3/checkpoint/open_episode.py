@@ -27,7 +27,7 @@ class ReplayableEpisode(
 
     Example:
         >>> import gymnasium as gym
-        >>> from regil_sb3.open_episode import ReplayableEpisode
+        >>> from regil_sb3.checkpoint import ReplayableEpisode
         >>> env, later = (ReplayableEpisode(gym.make("ToyReach-v0")) for _ in range(2))
         >>> _, _ = env.reset(seed=7)
         >>> _ = env.step(env.action_space.high)

@@ -18,7 +18,7 @@ from regil_wrappers.correction import Servo
 from regil_wrappers.pinhole import nearest_to_path
 from regil_wrappers.registration import Displacement, register
 
-from regil_sb3.pictures import data_uri
+from regil_sb3.report.pictures import data_uri
 
 __all__ = ["GuideView", "Moved", "guide_picture", "guide_view"]
 

@@ -16,8 +16,8 @@ import numpy.typing as npt
 from regil_wrappers import Retriever
 from regil_wrappers.reward_signals import AT_EVERY_STEP, Signal, make_signal
 
-from regil_sb3.doctor_episodes import Played
-from regil_sb3.findings import Finding, Verdict
+from regil_sb3.doctor.episodes import Played
+from regil_sb3.doctor.findings import Finding, Verdict
 
 __all__ = ["Reward", "check_reward", "judged", "played_demonstration", "signals"]
 

@@ -24,7 +24,8 @@ from regil_wrappers.alignment import nearest
 from regil_wrappers.limits import need
 from regil_wrappers.memory import Search
 
-from regil_sb3 import machine, process
+from regil_sb3 import process
+from regil_sb3.bench import machine
 
 __all__ = ["DIMS", "FRAMES", "Row", "draw", "growth", "indexes", "main", "measure"]
 

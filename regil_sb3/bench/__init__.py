@@ -1,0 +1,7 @@
+"""`regil bench TABLE`: this project measured, beside others.
+
+* ``tables`` - the command: which tables there are, and what each compares
+* ``guide``, ``rewards``, ``latency``, ``memory``, ``throughput`` - measured at once
+* ``run_tables`` - tables made of many training runs, and ``runs``, which makes each run once
+* ``peers`` - other packages' alignments; ``machine``, ``timing`` - what it ran on, and how long
+"""
