@@ -20,8 +20,14 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from toy import Reach, demonstration
 
-from regil_sb3 import TD3BC, checkpoint, open_episode
-from regil_sb3.checkpoint import CheckpointCallback, Preempted, ReplayableEpisode
+from regil_sb3 import TD3BC
+from regil_sb3.checkpoint import (
+    CheckpointCallback,
+    Preempted,
+    ReplayableEpisode,
+    callback,
+    open_episode,
+)
 from regil_sb3.checkpoint.learner_state import learner_state
 
 STEPS = 200
@@ -54,7 +60,7 @@ def new_model(env, policy="CnnPolicy", **changes):
 
 
 def test_the_examples_run(tmp_path):
-    for module in (checkpoint, open_episode):
+    for module in (callback, open_episode):
         own = {"folder": tmp_path, "gym": gym, "ReplayableEpisode": ReplayableEpisode}
         failed, tried = doctest.testmod(module, extraglobs=own)
         assert failed == 0 < tried
