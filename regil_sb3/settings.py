@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper, make_encoder
 
-from regil_sb3.baselines import BAKU, BC, ROT
+from regil_sb3.baselines import BAKU, BC, ROT, ReverseForwardCurriculum
 from regil_sb3.td3bc import TD3BC
 
 ALGOS: dict[str, type[TD3BC] | type[BAKU]] = {"td3bc": TD3BC, "bc": BC, "rot": ROT, "baku": BAKU}
@@ -22,6 +22,10 @@ ALGOS: dict[str, type[TD3BC] | type[BAKU]] = {"td3bc": TD3BC, "bc": BC, "rot": R
 RETRIEVAL = {
     "regil_wrappers.RetrievalGuideWrapper": RetrievalGuideWrapper,
     "regil_wrappers.RetrievalRewardWrapper": RetrievalRewardWrapper,
+}
+_TAKE_DEMO = {
+    **RETRIEVAL,
+    "regil_sb3.baselines.ReverseForwardCurriculum": ReverseForwardCurriculum,
 }
 _WRAPPER_HOMES = ("regil_wrappers.", "gymnasium.wrappers.", "stable_baselines3.common.")
 _NOT_SETTABLE = {
@@ -112,7 +116,7 @@ class Settings:
         return settings
 
     def wrappers(self, demo: str) -> list[tuple[Any, dict[str, Any]]]:
-        """Wrapper classes with their arguments, inner first; the retrieval ones get ``demo``.
+        """Wrapper classes with their arguments, inner first; ours get ``demo``.
 
         Raises:
             ValueError: a name that is no wrapper of the packages allowed here.
@@ -123,8 +127,8 @@ class Settings:
                 next(iter(entry.items())) if isinstance(entry, dict) else (entry, None)
             )
             arguments = dict(arguments or {})
-            if name in RETRIEVAL:
-                out.append((RETRIEVAL[name], {**arguments, "demo": demo}))
+            if name in _TAKE_DEMO:
+                out.append((_TAKE_DEMO[name], {**arguments, "demo": demo}))
                 continue
             if not str(name).startswith(_WRAPPER_HOMES):
                 raise ValueError(
@@ -195,6 +199,7 @@ def make_settings(
     settings.hyperparams.pop("demo", None)  # the run folder's own copy is used
     if settings.algo != "td3bc":  # another algorithm takes what it shares with ours
         settings.hyperparams = {k: v for k, v in settings.hyperparams.items() if k in known}
+    settings.env_wrapper += changes.pop("env_wrapper", [])  # outside the others
     for key, value in {**changes, **pairs(overrides or [])}.items():
         _override(settings, key, value)
     if steps is not None:
