@@ -11,6 +11,8 @@ __all__ = [
     "LIBERO_TASKS",
     "METAWORLD_TASKS",
     "REHEARSAL_TASKS",
+    "ROBOSUITE_ROBOTS",
+    "ROBOSUITE_TASKS",
     "register_envs",
 ]
 
@@ -75,8 +77,38 @@ REHEARSAL_TASKS = ("reach", "insert", "open")
 """The paper's tasks on a real robot."""
 
 
+ROBOSUITE_TASKS = (
+    "door",
+    "lift",
+    "nut-assembly",
+    "nut-assembly-round",
+    "nut-assembly-square",
+    "pick-place",
+    "pick-place-bread",
+    "pick-place-can",
+    "pick-place-cereal",
+    "pick-place-milk",
+    "stack",
+    "wipe",
+)
+"""robosuite's tasks for one arm, in kebab case. Its `NutAssemblySingle` and `PickPlaceSingle` are
+left out: which object they take, no seed decides."""
+
+ROBOSUITE_ROBOTS = {
+    "iiwa": "IIWA",
+    "jaco": "Jaco",
+    "kinova3": "Kinova3",
+    "panda": "Panda",
+    "sawyer": "Sawyer",
+    "ur5e": "UR5e",
+}
+"""robosuite's arms, by the names they have in ids."""
+
+
 def register_envs() -> None:
-    """Register `regil/metaworld-<task>-v0`, `regil/libero-...` and `regil/rehearsal-...`.
+    """Register `regil/<simulator>-<task>-v0`: metaworld, libero, robosuite and rehearsal.
+
+    robosuite's name the arm too: `regil/robosuite-<task>-<robot>-v0`.
 
     `regil/metaworld-<task>-state-v0` is the first with `obs="state", render_mode="rgb_array"`: for
     policies that see no picture, and rewards that do (`image="render"`).
@@ -84,8 +116,6 @@ def register_envs() -> None:
     The time limit is not Gymnasium's: it sits inside the environment (`max_steps`), where it
     counts agent steps under the action repeat and truncates.
     """
-    from gymnasium.envs.registration import register, registry
-
     simulators = {
         "metaworld": ("regil_sb3.envs.metaworld:MetaWorldEnv", METAWORLD_TASKS),
         "libero": ("regil_sb3.envs.libero:LiberoEnv", LIBERO_TASKS),
@@ -93,14 +123,22 @@ def register_envs() -> None:
     }
     for simulator, (entry_point, tasks) in simulators.items():
         for task in tasks:
-            env_id = f"regil/{simulator}-{task}-v0"
-            if env_id not in registry:  # calling it twice is harmless and warns of nothing
-                register(env_id, entry_point=entry_point, kwargs={"task": task})
+            _register(f"{simulator}-{task}", entry_point, task=task)
     for task in METAWORLD_TASKS:
-        env_id = f"regil/metaworld-{task}-state-v0"
-        if env_id not in registry:
-            seen = {"obs": "state", "render_mode": "rgb_array"}
-            register(env_id, entry_point=simulators["metaworld"][0], kwargs={"task": task, **seen})
+        seen = {"obs": "state", "render_mode": "rgb_array"}
+        _register(f"metaworld-{task}-state", simulators["metaworld"][0], task=task, **seen)
+    for task in ROBOSUITE_TASKS:
+        for robot in ROBOSUITE_ROBOTS:
+            entry_point = "regil_sb3.envs.robosuite:RobosuiteEnv"
+            _register(f"robosuite-{task}-{robot}", entry_point, task=task, robot=robot)
+
+
+def _register(name: str, entry_point: str, **kwargs: str) -> None:
+    from gymnasium.envs.registration import register, registry
+
+    env_id = f"regil/{name}-v0"
+    if env_id not in registry:  # calling it twice is harmless and warns of nothing
+        register(env_id, entry_point=entry_point, kwargs=kwargs)
 
 
 register_envs()

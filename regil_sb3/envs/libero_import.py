@@ -21,13 +21,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from regil_sb3.envs.robosuite_import import INSTALL, import_robosuite
+from regil_sb3.envs.robosuite_import import import_robosuite
 
 __all__ = ["ASSETS", "bddl_file", "import_libero", "initial_states"]
 
 ASSETS = "REGIL_LIBERO_ASSETS"
 """The environment variable that says where LIBERO's assets are."""
 
+_INSTALL = (
+    "pip install 'regil-sb3[libero]', "
+    "then pip install --no-deps robosuite==1.4.0 hf-libero==0.1.4 bddl==1.0.1"
+)
 _GET_ASSETS = (
     "take the folder libero/libero/assets of github.com/Lifelong-Robot-Learning/LIBERO "
     f"and name it in the environment variable {ASSETS}"
@@ -48,7 +52,7 @@ def import_libero() -> Any:
         ValueError: where the assets are not there.
     """
     assets = _assets()
-    import_robosuite()
+    import_robosuite(_INSTALL)
     try:
         libero = _configured()
         libero._assets_path_cache = str(assets)
@@ -56,14 +60,14 @@ def import_libero() -> Any:
             warnings.simplefilter("ignore")
             import libero.libero.envs as envs  # type: ignore[import-untyped]
     except ModuleNotFoundError as error:
-        raise ImportError(f"LIBERO is not installed ({error}): {INSTALL}") from None
+        raise ImportError(f"LIBERO is not installed ({error}): {_INSTALL}") from None
     return envs
 
 
 def _package() -> Path:
     spec = importlib.util.find_spec("libero")
     if spec is None or spec.origin is None:
-        raise ImportError(f"LIBERO is not installed: {INSTALL}")
+        raise ImportError(f"LIBERO is not installed: {_INSTALL}")
     return Path(spec.origin).parent / "libero"
 
 

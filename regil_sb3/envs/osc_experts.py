@@ -28,7 +28,6 @@ NEAR, EXACT = 0.015, 0.006
 _GAIN = 15.0  # of full actions for each metre that is left
 _TURN_GAIN = 1.0  # of full actions for each radian
 _LONGEST = 60  # steps until a place is given up as out of reach
-_GRASP, _RELEASE = 14, 8  # steps that fingers are given
 
 
 class Arm:
@@ -104,15 +103,15 @@ class Arm:
         for _ in range(steps):
             yield self._action(np.zeros(3), np.zeros(3))
 
-    def grasp(self) -> Iterator[Action]:
+    def grasp(self, steps: int = 14) -> Iterator[Action]:
         """Close the gripper."""
         self.gripper = 1.0
-        yield from self.hold(_GRASP)
+        yield from self.hold(steps)
 
-    def release(self) -> Iterator[Action]:
+    def release(self, steps: int = 8) -> Iterator[Action]:
         """Open the gripper."""
         self.gripper = -1.0
-        yield from self.hold(_RELEASE)
+        yield from self.hold(steps)
 
     def rest(self) -> Iterator[Action]:
         """Stay there for ever."""

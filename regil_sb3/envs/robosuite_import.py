@@ -14,15 +14,15 @@ from typing import Any
 
 __all__ = ["INSTALL", "import_robosuite"]
 
-INSTALL = (
-    "pip install 'regil-sb3[libero]', "
-    "then pip install --no-deps robosuite==1.4.0 hf-libero==0.1.4 bddl==1.0.1"
-)
-"""The last three declare dependencies that are not needed, among them a second OpenCV."""
+INSTALL = "pip install 'regil-sb3[robosuite]', then pip install --no-deps robosuite==1.4.0"
+"""The last one declares dependencies that are not needed, among them a second OpenCV."""
 
 
-def import_robosuite() -> Any:
+def import_robosuite(install: str = INSTALL) -> Any:
     """Import robosuite, once its settings are quiet.
+
+    Args:
+        install: what to tell a user who has it not, or in another version.
 
     Returns:
         the package.
@@ -33,12 +33,12 @@ def import_robosuite() -> Any:
     if "robosuite" not in sys.modules:
         spec = importlib.util.find_spec("robosuite")
         if spec is None or spec.origin is None:
-            raise ImportError(f"robosuite is not installed: {INSTALL}")
+            raise ImportError(f"robosuite is not installed: {install}")
         # Read by the package's own first lines, so that it must be there before them
         path = Path(spec.origin).with_name("macros.py")
         own = importlib.util.spec_from_file_location("robosuite.macros", path)
         if own is None or own.loader is None:
-            raise ImportError(f"{path} cannot be imported: {INSTALL}")
+            raise ImportError(f"{path} cannot be imported: {install}")
         macros: Any = importlib.util.module_from_spec(own)
         own.loader.exec_module(macros)
         macros.MUJOCO_GPU_RENDERING = False
@@ -49,5 +49,5 @@ def import_robosuite() -> Any:
         import robosuite  # type: ignore[import-untyped]
 
     if not robosuite.__version__.startswith("1.4."):
-        raise ImportError(f"robosuite {robosuite.__version__} is not 1.4: {INSTALL}")
+        raise ImportError(f"robosuite {robosuite.__version__} is not 1.4: {install}")
     return robosuite
