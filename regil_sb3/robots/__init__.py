@@ -3,7 +3,7 @@
 * ``interfaces`` - the protocols of camera, arm and clock, and what goes wrong with them
 * ``limits`` - how far, how fast and where the hand may go, below any policy
 * ``episodes`` - every episode on disk, whatever happens
-* ``cameras``, ``arms`` - drivers; each imports its library when it is made
+* ``cameras``, ``arms``, ``ros`` - drivers; each imports its library when it is made
 * ``operator`` - a person at the keyboard: success, abort, pause, and moving the hand
 * ``rehearsal`` - a simulated robot in a process of its own
 

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from regil_sb3.robots.interfaces import ArmState, RobotError
+from regil_sb3.robots.interfaces import ArmState, RobotError, first_line
 
 __all__ = ["FrankaArm"]
 
@@ -82,7 +83,7 @@ class FrankaArm:
                     self._closed = closed
                     self._grip(closed)
             except Exception as error:  # see above
-                raise RobotError(f"arm: {_line(error)}") from None
+                raise RobotError(f"arm: {first_line(error)}") from None
 
     def stop(self) -> None:
         """Come to rest as fast as the limits allow."""
@@ -92,7 +93,7 @@ class FrankaArm:
                 if self._robot.is_in_control:
                     self._robot.move(self._franky.CartesianStopMotion(), asynchronous=True)
             except Exception as error:  # see above
-                raise RobotError(f"arm: {_line(error)}") from None
+                raise RobotError(f"arm: {first_line(error)}") from None
 
     def recover(self) -> None:
         """Acknowledge errors, and be ready to move."""
@@ -105,7 +106,7 @@ class FrankaArm:
                 raise
             except Exception as error:  # see above
                 if self._robot.has_errors:
-                    raise RobotError(f"arm: {_line(error)}") from None
+                    raise RobotError(f"arm: {first_line(error)}") from None
             self._held = False
 
     def close(self) -> None:
@@ -139,10 +140,5 @@ class FrankaArm:
             try:
                 self._state = self._asked(self._state)
             except Exception as error:  # see above
-                before = self._state
-                self._state = ArmState(before.position, before.closed, before.time, _line(error))
+                self._state = replace(self._state, error=first_line(error))
             time.sleep(_POLL)
-
-
-def _line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -18,10 +18,10 @@ import numpy.typing as npt
 
 from regil_sb3.robots.interfaces import Picture, RobotError
 
-__all__ = ["OpenCVCamera", "RealSenseCamera"]
+__all__ = ["GrabbingCamera", "OpenCVCamera", "RealSenseCamera"]
 
 
-class _GrabbingCamera:
+class GrabbingCamera:
     """Keeps the newest picture; subclasses open, grab (which may wait) and release."""
 
     def __init__(self, name: str, size: tuple[int, int], rate: int) -> None:
@@ -91,7 +91,7 @@ class _GrabbingCamera:
         raise NotImplementedError
 
 
-class OpenCVCamera(_GrabbingCamera):
+class OpenCVCamera(GrabbingCamera):
     """A camera that OpenCV opens: USB, network, or a film in place of one.
 
     Args:
@@ -137,7 +137,7 @@ class OpenCVCamera(_GrabbingCamera):
         self._capture.release()
 
 
-class RealSenseCamera(_GrabbingCamera):
+class RealSenseCamera(GrabbingCamera):
     """The colour camera of an Intel RealSense (D435 and its kind); needs ``pyrealsense2``.
 
     Args:

@@ -3,7 +3,7 @@
 * ``Camera``, ``Arm`` - protocols of few methods, none of which waits
 * ``Picture``, ``ArmState`` - what they give, with the time it was true
 * ``Clock``, ``RealClock`` - the time that passes, and who is called as it does
-* ``RobotError`` - what is wrong, in one line
+* ``RobotError``, ``first_line`` - what is wrong, in one line
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Arm", "ArmState", "Camera", "Clock", "Picture", "RealClock", "RobotError"]
+__all__ = ["Arm", "ArmState", "Camera", "Clock", "Picture", "RealClock", "RobotError", "first_line"]
 
 
 class RobotError(OSError):
@@ -154,3 +154,8 @@ class RealClock:
                 thread.join()
 
         return end
+
+
+def first_line(error: Exception) -> str:
+    """What a library's error says, in one line."""
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import contextlib
 import importlib.util
+import json
 import os
 import pty
 import threading
@@ -11,6 +14,8 @@ import time
 import cv2
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import serve
 
 from regil_sb3.envs.robot import RobotEnv
 from regil_sb3.robots.arms import FrankaArm
@@ -19,6 +24,7 @@ from regil_sb3.robots.interfaces import RobotError
 from regil_sb3.robots.limits import Limits
 from regil_sb3.robots.operator import Keyboard
 from regil_sb3.robots.rehearsal import Rehearsal
+from regil_sb3.robots.ros import RosArm, RosCamera
 
 
 def filmed(path, pictures):
@@ -127,3 +133,136 @@ def test_a_real_camera_beside_a_simulated_arm(tmp_path):
     assert env.encoder_frame(100).shape == (100, 100, 3)
     assert env.metadata["regil"]["camera"] == f"opencv:{film}"
     env.close()
+
+
+class FakeRobot:
+    """rosbridge's side of a robot: a camera at 50 Hz, and a hand that is where it is sent."""
+
+    TOPICS = ("/camera", "/hand")
+
+    def __init__(self):
+        self.hand, self.stamp = np.array([0.4, 0.0, 0.3]), 0
+        self.received, self.moves, self.silent = [], True, False
+        self.data = base64.b64encode(cv2.imencode(".png", CAMERA[..., ::-1])[1]).decode()
+        self.start()
+
+    def start(self, port=0):
+        self.server = serve(self.serve, "localhost", port)
+        self.port = self.server.socket.getsockname()[1]
+        self.address = f"ws://localhost:{self.port}"
+        self.thread = threading.Thread(target=self.server.serve_forever)
+        self.thread.start()
+
+    def stop(self):
+        self.server.shutdown()
+        self.thread.join()
+
+    def pose(self, at):
+        header = {"frame_id": "base", "stamp": {"sec": 0, "nanosec": self.stamp}}
+        position = dict(zip("xyz", map(float, at), strict=True))
+        return {"header": header, "pose": {"position": position, "orientation": DOWN}}
+
+    def serve(self, socket):
+        topics = {}
+        while True:
+            try:
+                said = json.loads(socket.recv(0.02))
+            except TimeoutError:
+                said = {"op": None}
+            except ConnectionClosed:
+                return
+            self.received.append(said)
+            if said["op"] == "subscribe":
+                topics[said["topic"]] = said["type"]
+            elif said["op"] == "publish" and said["topic"] == "/go":
+                self.hand = np.array([said["msg"]["pose"]["position"][a] for a in "xyz"])
+            self.stamp += self.moves
+            for topic in () if self.silent else topics:
+                message = {"data": self.data} if topic == "/camera" else self.pose(self.hand)
+                with contextlib.suppress(ConnectionClosed):
+                    socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
+
+
+CAMERA = np.zeros((120, 160, 3), np.uint8)
+CAMERA[:, :80] = (255, 0, 0)
+DOWN = {"x": 1.0, "y": 0.0, "z": 0.0, "w": 0.0}
+
+
+@pytest.fixture
+def robot():
+    fake = FakeRobot()
+    yield fake
+    fake.stop()
+
+
+def test_a_camera_of_ros(robot):
+    camera = RosCamera("/camera", robot.address, (160, 120))
+    picture = waited(camera.read)
+    np.testing.assert_array_equal(picture.image, CAMERA)
+    waited(lambda: camera.read().time > picture.time)
+    robot.silent = True
+    waited(lambda: camera._error)
+    with pytest.raises(RobotError, match="camera ros:/camera: no picture for 2 s"):
+        camera.read()
+    robot.silent = False
+    camera.recover()
+    assert waited(camera.read)
+    camera.close()
+    with pytest.raises(ValueError, match="gives 160x120 pictures, not 640x480"):
+        RosCamera("/camera", robot.address)
+    robot.data = base64.b64encode(b"no picture").decode()
+    with pytest.raises(ValueError, match="gives no picture: what it sends is neither JPEG nor"):
+        RosCamera("/camera", robot.address)
+
+
+def test_an_arm_of_ros(robot):
+    arm = RosArm("/hand", "/go", "/grip", address=robot.address)
+    waited(lambda: sum(said["op"] == "advertise" for said in robot.received) == 2)
+    kinds = {said["topic"]: said["type"] for said in robot.received if said["op"] == "advertise"}
+    assert kinds == {"/go": "geometry_msgs/msg/PoseStamped", "/grip": "std_msgs/msg/Bool"}
+    np.testing.assert_allclose(arm.state().position, [0.4, 0.0, 0.3])
+    arm.move(np.array([0.41, 0.02, 0.25]), True)
+    waited(lambda: np.allclose(arm.state().position, [0.41, 0.02, 0.25]))
+    assert arm.state().closed
+    arm.stop()
+    arm.move(np.array([0.0, 0.0, 0.0]), False)  # does not count
+    waited(lambda: sum(said["op"] == "publish" for said in robot.received) == 3)
+    said = [(s["topic"], s["msg"]) for s in robot.received if s["op"] == "publish"]
+    assert [topic for topic, _ in said] == ["/go", "/grip", "/go"]
+    assert said[1][1] == {"data": True}
+    assert said[2][1]["pose"] == {
+        "position": {"x": 0.41, "y": 0.02, "z": 0.25},
+        "orientation": DOWN,
+    }
+    assert said[2][1]["header"]["frame_id"] == "base"
+    robot.moves = False  # the driver repeats itself: its state is as old as its stamp
+    time.sleep(0.1)
+    old = arm.state().time
+    time.sleep(0.1)
+    assert arm.state().time == old
+    robot.moves = True
+    robot.stop()
+    waited(lambda: arm._bridge.error)
+    for call in (arm.state, arm.stop):
+        with pytest.raises(RobotError, match="arm: rosbridge at ws://localhost:"):
+            call()
+    with pytest.raises(RobotError, match=r"does not answer .*: is rosbridge_server running there"):
+        arm.recover()
+    robot.start(robot.port)
+    arm.recover()
+    arm.move(np.array([0.42, 0.0, 0.3]), False)
+    waited(lambda: np.allclose(arm.state().position, [0.42, 0.0, 0.3]))
+    arm.close()
+
+
+def test_ros_topics_that_say_nothing(robot):
+    robot.silent = True
+    with pytest.raises(ValueError, match="/hand says no pose: nothing came for 2 s"):
+        RosArm("/hand", address=robot.address)
+    with pytest.raises(ValueError, match="camera ros:/camera gives no picture: no picture for 2 s"):
+        RosCamera("/camera", robot.address)
+    with pytest.raises(ValueError, match="ws://localhost:9 does not answer"):
+        RosArm(address="ws://localhost:9")
+    robot.silent, robot.pose = False, lambda at: {"header": {}}
+    with pytest.raises(ValueError, match=r"/hand says no pose: .*: a message lacks 'pose'"):
+        RosArm("/hand", address=robot.address)
