@@ -172,6 +172,9 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
                 "mirror": 1,
             },
         }
+        if self._noise.any():
+            std = np.maximum(self._noise / np.sqrt(3), 1e-3)  # of a uniform distribution
+            self.metadata["regil"]["start_std"] = (std / limits.delta).tolist()
         self._end_watch = self._clock.every(self._period / _CHECKS, self._watch)
         try:
             self._picture = self._fresh(_RECOVERY)

@@ -41,7 +41,7 @@ class Episode:
         self._moves_back = moves_back
         self._said_camera = False
         self._taken: NDArray[np.bool_] | None = None
-        self._arm: NDArray[np.bool_] | None = None
+        self._arms: dict[int, NDArray[np.bool_]] = {}  # by the step of the grasp
         self.begin()
 
     def begin(self) -> None:
@@ -89,7 +89,11 @@ class Episode:
         if self._first is None:
             raise ValueError("there is no picture yet: call reset() of the environment")
         if not self._registered:
-            self._displacement = found = register(self.frames.recorded_first, self._first)
+            among = None
+            if self.frames.hand_starts_elsewhere:  # it would be what has moved
+                recorded = self.frames.recorded
+                among = ~self._arm_of(len(recorded) // 2)
+            self._displacement = found = register(self.frames.recorded_first, self._first, among)
             self._registered = True
             if found is not None and any(found.camera) and not self._said_camera:
                 self._said_camera = True
@@ -118,15 +122,19 @@ class Episode:
             self._taken = taken_up(self.frames.recorded, grasp)
         taken, among = self._taken, None
         if near is not None:
-            if self._arm is None:
-                self._arm = arm_at_start(self.frames.recorded, grasp)
+            arm = self._arm_of(grasp)
             at_grasp, at_end = near
-            taken = taken & self._round(at_grasp, _TAKEN) & ~self._arm
+            taken = taken & self._round(at_grasp, _TAKEN) & ~arm
             if taken.any():  # where the hand ends, seen from what it holds
                 ys, xs = np.nonzero(taken)
                 at_end = np.array([xs.mean(), ys.mean()]) + at_end - at_grasp
-            among = (self._round(at_grasp, _TAKEN) | self._round(at_end, _PLACE)) & ~self._arm
+            among = (self._round(at_grasp, _TAKEN) | self._round(at_end, _PLACE)) & ~arm
         return register_apart(self.frames.recorded_first, self._first, taken, among)
+
+    def _arm_of(self, grasp: int) -> NDArray[np.bool_]:
+        if grasp not in self._arms:
+            self._arms[grasp] = arm_at_start(self.frames.recorded, grasp)
+        return self._arms[grasp]
 
     def _round(self, point: Point, radius: float) -> NDArray[np.bool_]:
         height, width = self.frames.recorded_first.shape[:2]

@@ -138,6 +138,11 @@ class FrameSource:
         size = (width, depth) if self._channels_first else (height, width)
         check_size(size, demo.frames.shape[1:3], label)
 
+    @property
+    def hand_starts_elsewhere(self) -> bool:
+        """Whether the environment says that its hand does not start in one place."""
+        return bool((self._env.unwrapped.metadata.get("regil") or {}).get("start_std"))
+
     def use_encoder_frames(self) -> bool:
         """Take the environment's larger pictures from now on, where there are such.
 

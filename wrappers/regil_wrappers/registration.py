@@ -71,7 +71,9 @@ class Displacement:
     camera: tuple[float, float] = (0.0, 0.0)
 
 
-def register(reference: Picture, picture: Picture) -> Displacement | None:
+def register(
+    reference: Picture, picture: Picture, among: NDArray[np.bool_] | None = None
+) -> Displacement | None:
     """What moved from one picture to the other, and how far.
 
     Pixels that differ are taken, and the shift and growth sought that make both pictures agree on
@@ -82,6 +84,7 @@ def register(reference: Picture, picture: Picture) -> Displacement | None:
     Args:
         reference: (H, W, 3) uint8, the first picture.
         picture: (H, W, 3) uint8, the second, from the same camera.
+        among: (H, W), the pixels that count; None: all. What is elsewhere may move by itself.
 
     Returns:
         the displacement, or None where nothing has moved. Where only the camera has, a shift of 0.
@@ -89,7 +92,7 @@ def register(reference: Picture, picture: Picture) -> Displacement | None:
     Raises:
         ValueError: if the pictures differ in shape or are not uint8 (H, W, 3).
     """
-    pair = comparable(reference, picture)
+    pair = comparable(reference, picture, among)
     a, b, unit, camera = pair.a, pair.b, pair.unit, pair.camera
     turned = (float(camera[0]), float(camera[1]))
     changed, hull = pair.changed, pair.hull
