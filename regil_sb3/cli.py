@@ -286,7 +286,7 @@ def _train(args: argparse.Namespace) -> None:
     from regil_sb3 import process, training
     from regil_sb3.checkpoint.callback import Preempted
     from regil_sb3.robots.interfaces import RobotError
-    from regil_sb3.run_folder import checkpoints_of, refuse_finished
+    from regil_sb3.run_folder import has_checkpoint, refuse_finished
     from regil_sb3.settings import encoder_size, make_settings
 
     process.keep_freed_memory()
@@ -321,7 +321,7 @@ def _train(args: argparse.Namespace) -> None:
                     ) from error
             training.train(settings, Demonstration.load(demo), run)
     except (KeyboardInterrupt, Preempted, RobotError):
-        if checkpoints_of(run).exists():
+        if has_checkpoint(run):
             print(f"\nsaved; go on with: regil train --resume {run}", file=sys.stderr)
         elif (run / "model.zip").exists():
             print(f"\nthe model is in {run}: regil evaluate {run}", file=sys.stderr)

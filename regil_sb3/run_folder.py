@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import shutil
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +16,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
+from regil_sb3.checkpoint.generations import Generations
 from regil_sb3.files import replacing
+from regil_sb3.model_file import checked_model
 
 
 def refuse_finished(run: Path) -> None:
@@ -34,6 +37,16 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
     """Save a model; the old file stays until the new one is complete."""
     with replacing(path) as file:
         model.save(file)
+
+
+def steps_learned(path: Path) -> int:
+    """For how many steps a saved model has learned.
+
+    Raises:
+        ValueError: it is no model, or damaged.
+    """
+    with checked_model(path) as file, zipfile.ZipFile(file) as archive:
+        return int(json.loads(archive.read("data"))["num_timesteps"])
 
 
 def save_calibration(env: VecEnv, path: Path) -> None:
@@ -65,6 +78,11 @@ def load_calibration(env: VecEnv, path: Path) -> bool:
 def checkpoints_of(run: Path) -> Path:
     """Where a run's checkpoints are until it has ended."""
     return run / "checkpoints"
+
+
+def has_checkpoint(run: Path) -> bool:
+    """Whether there is one to go on from."""
+    return bool(Generations(checkpoints_of(run)).numbers)
 
 
 def forget_checkpoints(run: Path) -> None:

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -43,11 +44,13 @@ from regil_sb3.run_folder import (
     best_so_far,
     checkpoints_of,
     forget_checkpoints,
+    has_checkpoint,
     load_calibration,
     locked,
     refuse_finished,
     save_calibration,
     save_model,
+    steps_learned,
 )
 from regil_sb3.settings import ALGOS, Settings
 from regil_sb3.td3bc import TD3BC
@@ -223,12 +226,9 @@ def train(settings: Settings, demo: Demonstration, run: Path) -> None:
 
 def has_learned(run: Path, settings: Settings) -> bool:
     """Whether a run has made all its steps, evaluated or not."""
-    algo = ALGOS[settings.algo]
-    if not (run / "model.zip").exists():
+    if not (run / "model.zip").exists() or has_checkpoint(run):
         return False
-    if issubclass(algo, Offline):
-        return bool(algo.load(run / "model.zip").num_timesteps >= settings.steps)
-    return not checkpoints_of(run).exists()
+    return steps_learned(run / "model.zip") >= settings.steps
 
 
 def resume(run: Path) -> Settings:
@@ -266,6 +266,10 @@ def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> N
         checkpoints.restore(model)
     done = model.num_timesteps
     if not done:
+        if checkpoints is not None and log.exists() and log.stat().st_size:
+            warnings.warn(
+                f"{run} has no checkpoint to go on from: it begins anew at step 0", stacklevel=3
+            )
         log.unlink(missing_ok=True)
     every = max(settings.steps // 6, 1)
     # The callback reads the log before it is reopened

@@ -21,6 +21,7 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from regil_sb3 import __version__
 from regil_sb3.checkpoint.generations import Generations
 from regil_sb3.checkpoint.learner_state import check_can_be_kept, learner_state, load_learner_state
 from regil_sb3.td3bc import TD3BC
@@ -100,6 +101,8 @@ class CheckpointCallback(BaseCallback):
         self._saving = False
         self._before: dict[int, Any] = {}  # signals' handlers of others
         self._saved_at = 0  # the step of the last checkpoint
+        self._tried_at = 0  # the step at which the last one was to be saved
+        self._had_some = False  # whether there were checkpoints
         self._next = 0.0  # the time of the next one, on time.monotonic
         self._failed = ""
         self._pending: list[dict[str, Any]] = []  # of the logger
@@ -118,7 +121,15 @@ class CheckpointCallback(BaseCallback):
         if state is None:
             return 0
         check_can_be_kept(model)
-        lost = load_learner_state(model, state["learner"])
+        try:
+            lost = load_learner_state(model, state["learner"])
+        except (LookupError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"the checkpoint in {self.generations.folder} was written by regil-sb3 "
+                f"{self.generations.written_by}, and regil-sb3 {__version__} cannot go on from it "
+                f"({type(error).__name__}: {error}): go on with that version, or remove the folder "
+                "to begin anew"
+            ) from error
         if lost:
             warnings.warn(
                 f"going on at step {model.num_timesteps}, the open episodes are ended as "
@@ -128,7 +139,8 @@ class CheckpointCallback(BaseCallback):
         if self.log is not None and state["log"] is not None:
             self.log.write_text(state["log"], encoding="utf-8")
         self._pending = state["logger"]
-        self._saved_at = model.num_timesteps
+        self._saved_at = self._tried_at = model.num_timesteps
+        self._had_some = True
         return int(model.num_timesteps)
 
     def save(self) -> None:
@@ -153,11 +165,12 @@ class CheckpointCallback(BaseCallback):
             )
         finally:
             self._saving = False
-        self._saved_at = self.num_timesteps
+        self._saved_at, self._had_some = self.num_timesteps, True
 
     def _on_training_start(self) -> None:
         assert isinstance(self.model, TD3BC)
         check_can_be_kept(self.model)
+        self._told = None
         if self._pending:
             self.logger.name_to_value.update(self._pending[0])
             self.logger.name_to_count.update(self._pending[1])
@@ -174,10 +187,19 @@ class CheckpointCallback(BaseCallback):
             if self.num_timesteps != self._saved_at or not self.generations.numbers:
                 self._save_or_warn()
             raise self._end(self._told)
-        if not self.generations.numbers and not self._failed:
+        missing = not self.generations.numbers
+        if missing and self._had_some:
+            self._had_some = False
+            warnings.warn(
+                f"the checkpoints in {self.generations.folder} are gone: training goes on, and one "
+                f"is saved at step {self.num_timesteps}",
+                stacklevel=2,
+            )
+            self._save_or_warn()
+        elif missing and not self._failed:
             self._save_or_warn()
         elif self.steps is not None:
-            if self.num_timesteps - self._saved_at >= self.steps:
+            if self.num_timesteps - self._tried_at >= self.steps:
                 self._save_or_warn()
         elif time.monotonic() >= self._next:
             self._save_or_warn()
@@ -191,22 +213,24 @@ class CheckpointCallback(BaseCallback):
     def close(self) -> None:
         """Leave signals to who had them before; done at the end of ``learn``."""
         for number, handler in self._before.items():
-            signal.signal(number, handler)
+            # None: not set from Python
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
         if self._before:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
         self._before = {}
 
     def _save_or_warn(self) -> None:
-        began = time.monotonic()
+        began, self._tried_at = time.monotonic(), self.num_timesteps
         try:
             self.save()
             self._failed = ""
         except OSError as error:
             if str(error) != self._failed:
                 self._failed = str(error)
+                last = f"the last one is of step {self._saved_at}"
                 warnings.warn(
                     f"the checkpoint at step {self.num_timesteps} could not be saved ({error}): "
-                    f"training goes on; the last one is of step {self._saved_at}",
+                    f"training goes on; {last if self.generations.numbers else 'there is none'}",
                     stacklevel=2,
                 )
         took = time.monotonic() - began
@@ -217,8 +241,8 @@ class CheckpointCallback(BaseCallback):
         if os.getpid() != self._process:  # an environment's, forked from this one
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
-        if self._told is not None:  # a second time
-            self._break_off(number, None)
+        if self._told is not None:  # a second time; a save that is broken off loses no other
+            raise self._end(self._told)
         self._told = number
         self._before.setdefault(signal.SIGALRM, signal.signal(signal.SIGALRM, self._break_off))
         signal.setitimer(signal.ITIMER_REAL, self.grace)

@@ -2,7 +2,8 @@
 
 A folder holds ``000001``, ``000002`` ... and ``blocks``. A generation is written beside the others,
 waited for, and renamed in one step. Large arrays are cut into blocks, files named by the SHA-256 of
-their content and shared between generations: what has not changed is not written again.
+their content and shared between generations: what has not changed is not written again. It is read
+again, though, every few saves, and written anew from memory where the disk no longer has it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 import psutil
 
+from regil_sb3 import __version__
 from regil_sb3.checkpoint.snapshot import Array, Ring, put_together, take_apart
 from regil_sb3.files import sync_folder, write_durably
 
@@ -28,7 +30,21 @@ __all__ = ["Generations"]
 VERSION = 1
 BLOCK = 4 << 20  # bytes, at most
 SMALL = 64 << 10  # bytes: smaller arrays of a generation are in one file together
-_DAMAGE = (ValueError, OSError, KeyError, TypeError, IndexError, RecursionError, OverflowError)
+TRUSTED = 4  # saves, at most, that may reuse a block before it is read again
+_DAMAGE = (
+    ValueError,
+    OSError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RecursionError,
+    OverflowError,
+    SyntaxError,  # of NumPy, from a damaged name of a type
+)
+
+
+class OtherVersionError(ValueError):
+    """A generation is whole, and in a format that is not known here."""
 
 
 class Generations:
@@ -48,7 +64,10 @@ class Generations:
             raise ValueError(f"keep={keep}, max_bytes={max_bytes}: both must be at least 1")
         self.folder, self.keep, self.max_bytes = folder, keep, max_bytes
         self._blocks = folder / "blocks"
-        self._sound: set[str] = set()  # blocks that this process has written or read
+        # blocks that this process has written or read, and how many saves have relied on it since
+        self._sound: dict[str, int] = {}
+        self._there: dict[str, int] = {}  # bytes of the blocks that the disk had before a save
+        self.written_by = __version__  # of what was loaded
         self._rings: dict[str, tuple[int, list[list[Any]]]] = {}
 
     @property
@@ -70,7 +89,23 @@ class Generations:
             OSError: it could not be written; the others are as they were.
             ValueError: something in it cannot be held.
         """
+        try:
+            target = self._save(tree)
+        except OSError:
+            with contextlib.suppress(OSError):  # room, where the disk is full
+                self._remove_unneeded(self.numbers)
+            raise
+        try:
+            self._prune()
+        except OSError as error:
+            warnings.warn(
+                f"{target} is saved, but older ones could not be removed ({error})", stacklevel=2
+            )
+        return target
+
+    def _save(self, tree: Any) -> Path:
         self._blocks.mkdir(parents=True, exist_ok=True)
+        self._there = {file.name: file.stat().st_size for file in os.scandir(self._blocks)}
         new = self.folder / ".new"
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir()
@@ -83,7 +118,7 @@ class Generations:
                 return [len(small) - array.nbytes, len(small)]
             known = self._unchanged(ring, self._rings.get(at), array)
             blocks = [
-                known.get(i) or self._keep_block(part) for i, part in enumerate(_parts(array, ring))
+                self._keep_block(part, known.get(i)) for i, part in enumerate(_parts(array, ring))
             ]
             if ring is not None:
                 rings[at] = (ring.written, blocks)
@@ -91,27 +126,42 @@ class Generations:
 
         content = take_apart(tree, keep)
         sync_folder(self._blocks)
-        values = {"version": VERSION, "small": _sha256(memoryview(small)), "tree": content}
+        values = {
+            "version": VERSION,
+            "regil": __version__,
+            "small": _sha256(memoryview(small)),
+            "tree": content,
+        }
         body = json.dumps(values, separators=(",", ":")).encode()
         write_durably(new / "small.bin", memoryview(small))
         signed = _sha256(memoryview(body)).encode() + b"\n" + body
         write_durably(new / "state.json", memoryview(signed))
         sync_folder(new)
-        taken = [int(p.name[:6]) for p in self.folder.iterdir() if p.name[:6].isdecimal()]
+        taken = [int(p.stem) for p in self.folder.iterdir() if p.stem.isdecimal()]
         target = self.folder / f"{max(taken, default=0) + 1:06}"
         os.rename(new, target)
         sync_folder(self.folder)
         self._rings = rings
-        self._prune()
         return target
 
-    def _keep_block(self, part: memoryview) -> list[Any]:
+    def _keep_block(self, part: memoryview, known: list[Any] | None) -> list[Any]:
+        """Its name and length; written where the disk does not have it, or no longer as it was."""
+        name = known[0] if known else _sha256(part)
+        if name in self._sound and self._there.get(name) == len(part):
+            self._sound[name] += 1
+            if self._sound[name] < TRUSTED:
+                return [name, len(part)]
+            try:
+                self._block(name, len(part))
+                return [name, len(part)]
+            except (OSError, ValueError) as error:
+                warnings.warn(f"{self._blocks / name} is written anew ({error})", stacklevel=2)
         name = _sha256(part)
-        if name not in self._sound:
-            beside = self._blocks / ".new"
-            write_durably(beside, part)
-            os.rename(beside, self._blocks / name)
-            self._sound.add(name)
+        beside = self._blocks / ".new"
+        write_durably(beside, part)
+        os.rename(beside, self._blocks / name)
+        self._there[name] = len(part)
+        self._sound[name] = int(name[:4], 16) % TRUSTED  # not all are read at the same save
         return [name, len(part)]
 
     def _unchanged(
@@ -128,40 +178,64 @@ class Generations:
     # -- loading ---------------------------------------------------------------------------------
 
     def load(self) -> Any:
-        """The newest generation that is whole; None where there is none.
+        """The newest generation that is whole; None where none was ever saved.
 
         Newer ones that are damaged are warned of by name, and set aside as ``<number>.damaged``.
 
         Raises:
+            ValueError: there are some, and none is whole; or another version wrote the newest.
             MemoryError: it would not fit into memory.
         """
         for number in reversed(self.numbers):
             folder = self.folder / f"{number:06}"
             try:
                 return self._load(folder)
+            except OtherVersionError:
+                raise
             except _DAMAGE as error:
                 warnings.warn(f"{folder} is damaged ({error}): passed over", stacklevel=2)
-                with contextlib.suppress(OSError):  # a folder that is read-only
-                    os.rename(folder, folder.with_suffix(".damaged"))
+                if not isinstance(error, OSError) or isinstance(error, FileNotFoundError):
+                    with contextlib.suppress(OSError):  # a folder that is read-only
+                        os.rename(folder, folder.with_suffix(".damaged"))
+        if self.numbers or any(self.folder.glob("*.damaged")):
+            raise ValueError(
+                f"no checkpoint in {self.folder} is whole: remove that folder to begin anew"
+            )
         return None
 
     def _load(self, folder: Path) -> Any:
         values = _state(folder)
+        if values["version"] != VERSION:
+            raise OtherVersionError(
+                f"{folder} was written by regil-sb3 {values.get('regil', 'of another version')} in "
+                f"format {values['version']}, and regil-sb3 {__version__} reads format {VERSION}: "
+                f"go on with that version, or remove {self.folder} to begin anew"
+            )
+        self.written_by = str(values.get("regil", "0.1.0"))
         small = (folder / "small.bin").read_bytes()
         if _sha256(memoryview(small)) != values["small"]:
             raise ValueError("small.bin is not what was saved")
-        needed = sum(length for _, length in _blocks_of(values["tree"]))
+        blocks = list(_blocks_of(values["tree"]))
+        for name, length in blocks:  # before any memory is taken for them
+            self._path_of(name, length)
+        needed = sum(length for _, length in blocks)
         available = psutil.virtual_memory().available
         if needed > available:
             raise MemoryError(
                 f"{folder} needs {needed / 1e9:.1f} GB, but {available / 1e9:.1f} GB are available"
             )
 
+        taken = 0
+
         def fetch(kept: Any, n_bytes: int) -> bytearray:
+            nonlocal taken
             if isinstance(kept, list):
                 start, stop = kept
                 found = bytearray(small[start:stop])
                 length = len(found)
+                taken += length
+                if taken > len(small):
+                    raise ValueError("small.bin is used twice")
             else:
                 length = sum(int(length) for _, length in kept["blocks"])
             if length != n_bytes:
@@ -175,14 +249,20 @@ class Generations:
 
         return put_together(values["tree"], fetch)
 
-    def _block(self, name: str, length: int) -> bytes:
-        path = self._blocks / str(name)
+    def _path_of(self, name: str, length: int) -> Path:
+        path = self._blocks / name
         if path.parent != self._blocks or path.stat().st_size != length:
             raise ValueError(f"block {name} is not {length} bytes long")
-        content = path.read_bytes()
+        return path
+
+    def _block(self, name: str, length: int) -> bytes:
+        with self._path_of(name, length).open("rb") as file:
+            if hasattr(os, "posix_fadvise"):  # what the disk has, not what memory has of it
+                os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+            content = file.read()
         if _sha256(memoryview(content)) != name:
             raise ValueError(f"block {name} is not what was saved")
-        self._sound.add(name)
+        self._sound[name] = 0
         return content
 
     # -- pruning ---------------------------------------------------------------------------------
@@ -202,18 +282,26 @@ class Generations:
             shutil.rmtree(old, ignore_errors=True)
             os.rename(self.folder / f"{number:06}", old)
             shutil.rmtree(old)
-        needed = {name for n in kept for name in used[n]}
+        self._remove_unneeded(kept)
+
+    def _remove_unneeded(self, kept: list[int]) -> None:
+        """Blocks that none of these generations mentions."""
+        used = [self._files_of(self.folder / f"{n:06}") for n in kept]
+        if not all(used):  # one cannot be read, now at least: it may need any of them
+            return
+        needed = {name for files in used for name in files}
         for path in self._blocks.iterdir():
             if path.name not in needed:
                 path.unlink()
-                self._sound.discard(path.name)
+                self._sound.pop(path.name, None)
 
     def _files_of(self, folder: Path) -> dict[str, int]:
-        """Bytes of all that a generation needs, by name; what cannot be read needs nothing."""
-        sizes = {f"{folder.name}/{p.name}": p.stat().st_size for p in folder.iterdir()}
-        with contextlib.suppress(*_DAMAGE):
-            sizes |= {name: length for name, length in _blocks_of(_state(folder)["tree"])}
-        return sizes
+        """Bytes of all that a generation needs, by name; empty where that cannot be read."""
+        try:
+            sizes = {name: length for name, length in _blocks_of(_state(folder)["tree"])}
+            return sizes | {f"{folder.name}/{p.name}": p.stat().st_size for p in folder.iterdir()}
+        except _DAMAGE:
+            return {}
 
 
 def _sha256(content: memoryview) -> str:
@@ -226,8 +314,6 @@ def _state(folder: Path) -> dict[str, Any]:
     if _sha256(memoryview(body)).encode() != signature:
         raise ValueError("state.json is not what was saved")
     values: dict[str, Any] = json.loads(body)
-    if values["version"] != VERSION:
-        raise ValueError(f"version {values['version']} is not {VERSION}: made by another regil")
     return values
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 from regil_sb3.checkpoint.snapshot import Ring
@@ -60,6 +61,14 @@ def check_can_be_kept(model: TD3BC) -> None:
     """
     if model.get_vec_normalize_env() is not None:
         raise ValueError("a checkpoint holds no VecNormalize: leave it out")
+    noise = model.action_noise
+    if isinstance(noise, VectorizedActionNoise):
+        noise = noise.base_noise
+    if noise is not None and type(noise) is not NormalActionNoise:
+        raise ValueError(
+            f"a checkpoint cannot hold the state of a {type(noise).__name__}: use "
+            "NormalActionNoise, or exploration_std"
+        )
     buffer = model.replay_buffer
     if not (isinstance(buffer, FrameReplayBuffer) or type(buffer) in _OF_SB3):
         raise ValueError(

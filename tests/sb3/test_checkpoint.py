@@ -6,6 +6,7 @@ import doctest
 import errno
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from toy import Reach, demonstration
 
@@ -260,6 +262,84 @@ def test_what_takes_too_long_is_broken_off(tmp_path):
     with pytest.raises(Preempted):
         new_model(toy()).learn(STEPS, [checkpoints, Hang()])
     assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 80
+
+
+class At(BaseCallback):
+    """Does something at a step."""
+
+    def __init__(self, step, what):
+        super().__init__()
+        self.step, self.what = step, what
+
+    def _on_step(self):
+        if self.num_timesteps == self.step:
+            self.what()
+        return True
+
+
+def test_a_removed_folder_is_noticed_and_training_goes_on(tmp_path):
+    folder = tmp_path / "run" / "checkpoints"
+    remove = At(90, lambda: shutil.rmtree(tmp_path / "run"))
+    with pytest.warns(UserWarning, match="are gone: training goes on, and one is saved at step 90"):
+        new_model(toy()).learn(130, [CheckpointCallback(folder, steps=25), remove])
+    assert CheckpointCallback(folder).restore(new_model(toy())) == 115
+
+
+def test_where_no_folder_can_be_made_none_is_claimed(tmp_path):
+    folder = tmp_path / "run" / "checkpoints"
+
+    def replace():
+        shutil.rmtree(tmp_path / "run")
+        (tmp_path / "run").touch()
+
+    with pytest.warns(UserWarning, match="checkpoint") as said:
+        new_model(toy()).learn(130, [CheckpointCallback(folder, steps=25), At(90, replace)])
+    lines = [str(w.message) for w in said]
+    assert ["are gone" in line for line in lines] == [True, False]
+    assert lines[1].endswith("training goes on; there is none")
+
+
+def test_a_state_that_this_version_does_not_know_is_refused(tmp_path, monkeypatch):
+    assert live(tmp_path, toy(), 50) is None
+    monkeypatch.setattr(
+        callback, "load_learner_state", lambda model, state: state["something newer"]
+    )
+    with pytest.raises(ValueError, match=r"written by regil-sb3 .* go on with that version"):
+        CheckpointCallback(tmp_path).restore(new_model(toy()))
+
+
+def test_noise_with_a_state_is_refused(tmp_path):
+    zeros = np.zeros(2)
+    walk = OrnsteinUhlenbeckActionNoise(zeros, zeros + 0.1)
+    for n_envs in (1, 2):
+        model = new_model(toy(n_envs), action_noise=walk)
+        with pytest.raises(ValueError, match="state of a OrnsteinUhlenbeckActionNoise: use Normal"):
+            model.learn(40, CheckpointCallback(tmp_path))
+    calm = NormalActionNoise(zeros, zeros + 0.1)
+    new_model(toy(2), action_noise=calm).learn(40, CheckpointCallback(tmp_path))
+
+
+def test_a_second_signal_ends_a_save_that_hangs(tmp_path, monkeypatch):
+    hung = threading.Event()
+
+    def hang(*_):
+        hung.set()
+        time.sleep(30)
+
+    def begin():
+        monkeypatch.setattr(os, "fsync", hang)
+        threading.Thread(target=interrupt_twice).start()
+
+    def interrupt_twice():
+        for _ in range(2):
+            hung.wait(20)
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.2)
+
+    with pytest.raises(KeyboardInterrupt):
+        new_model(toy()).learn(200, [CheckpointCallback(tmp_path, steps=40), At(79, begin)])
+    monkeypatch.undo()
+    assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 40
 
 
 CHILD = """

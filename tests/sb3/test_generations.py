@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import errno
 import os
+import shutil
+import warnings
 
 import numpy as np
 import pytest
@@ -198,6 +200,100 @@ def test_the_budget_of_the_disk_is_kept_but_for_the_newest(tmp_path):
         learner.learn()
         roomy.save(learner.tree())
     assert roomy.numbers == [3, 4, 5, 6]
+
+
+def test_a_folder_that_is_removed_while_it_is_in_use(tmp_path):
+    learner, saver = Learner(), Generations(tmp_path / "checkpoints")
+    learner.learn(30)
+    saver.save(learner.tree())
+    shutil.rmtree(saver.folder)
+    learner.learn(1)  # most blocks have not changed
+    saver.save(learner.tree())
+    assert same(Generations(saver.folder).load(), learner.tree())
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "remove"])
+def test_a_shared_block_that_is_damaged_is_written_anew(damage, tmp_path):
+    """One byte of it would else cost every generation."""
+    learner, saver = Learner(), Generations(tmp_path)
+    learner.learn(30)
+    saver.save(learner.tree())
+    before = set((tmp_path / "blocks").iterdir())
+    learner.learn(1)
+    saver.save(learner.tree())
+    path = min(set((tmp_path / "blocks").iterdir()) & before)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    if damage == "remove":
+        path.unlink()
+    else:
+        path.write_bytes(data if damage == "flip" else data[:-1])
+    with pytest.raises(ValueError, match=r"no checkpoint in .* is whole"), pytest.warns():
+        Generations(shutil.copytree(tmp_path, tmp_path / "copy")).load()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for _ in range(generations.TRUSTED):
+            saver.save(learner.tree())
+    assert len(said) == (damage == "flip")
+    assert same(Generations(tmp_path).load(), learner.tree())
+
+
+def test_what_another_version_wrote_is_refused_and_kept(tmp_path, monkeypatch):
+    learner, saver = Learner(), Generations(tmp_path)
+    learner.learn(30)
+    monkeypatch.setattr(generations, "VERSION", 7)
+    monkeypatch.setattr(generations, "__version__", "9.8.7")
+    saver.save(learner.tree())
+    monkeypatch.undo()
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match=r"written by regil-sb3 9\.8\.7 in format 7") as refused:
+        Generations(tmp_path).load()
+    assert "\n" not in str(refused.value)
+    Generations(tmp_path).save({"a": np.zeros(5_000)})
+    assert set(before) < set(tmp_path.rglob("*"))
+
+
+def test_a_generation_that_cannot_be_read_now_keeps_its_blocks(tmp_path, monkeypatch):
+    learner, saver = Learner(), Generations(tmp_path)
+    learner.learn(30)
+    saver.save(learner.tree())
+    good = copy.deepcopy(learner.tree())
+    state_of = generations._state
+
+    def unreadable(folder):
+        if folder.name == "000001":
+            raise OSError(errno.EIO, "for now")
+        return state_of(folder)
+
+    monkeypatch.setattr(generations, "_state", unreadable)
+    learner.learn(45)
+    saver.save(learner.tree())
+    monkeypatch.undo()
+    shutil.rmtree(tmp_path / "000002")
+    assert same(Generations(tmp_path).load()["big"], good["big"])
+
+
+def test_a_failed_save_gives_its_room_back(tmp_path, monkeypatch):
+    learner, saver = Learner(), Generations(tmp_path)
+    learner.learn(30)
+    saver.save(learner.tree())
+    before = set((tmp_path / "blocks").iterdir())
+    faults = Faults(monkeypatch)
+    faults.how, faults.at = "torn", 10
+    learner.learn(9)
+    with pytest.raises(OSError, match="No space"):
+        saver.save(learner.tree())
+    assert set((tmp_path / "blocks").iterdir()) == before
+    saver.save(learner.tree())
+    assert same(Generations(tmp_path).load(), learner.tree())
+
+
+def test_the_millionth(tmp_path):
+    saver = Generations(tmp_path)
+    for name in ("999999", "1000000"):
+        saver.save({"a": name}).rename(tmp_path / name)
+    assert saver.save({"a": 1}).name == "1000001"
+    assert Generations(tmp_path).load() == {"a": 1}
 
 
 @pytest.mark.parametrize(
