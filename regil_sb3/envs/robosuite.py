@@ -27,6 +27,8 @@ __all__ = ["CAMERAS", "RobosuiteEnv"]
 CAMERAS = ("agentview", "frontview", "birdview", "robot0_eye_in_hand", "robot0_robotview")
 """robosuite's own cameras that every task has."""
 
+_SETTLE = 10  # steps in which what was placed above the table falls onto it
+_ALONE = ("lift", "door")  # tasks whose one thing is all that moves
 _FLAT = "robot0_head_"  # meshes of Sawyer's head
 
 
@@ -113,7 +115,10 @@ class RobosuiteEnv(OSCEnv, EzPickle):
             render_mode=render_mode,
             render_size=render_size,
             max_steps=max_steps,
-            facts={} if sim.robots[0].gripper.dof else {"gripper_dim": "none"},
+            facts={
+                "crowded": task not in _ALONE,
+                **({} if sim.robots[0].gripper.dof else {"gripper_dim": "none"}),
+            },
         )
 
     def targets(self) -> npt.NDArray[np.float64]:
@@ -135,6 +140,11 @@ class RobosuiteEnv(OSCEnv, EzPickle):
         self._sim._observables = self._observables  # some tasks say here which of them hold
         reset_simulation(self._sim, self._draws())
         self._sim._observables = {}
+        idle = np.zeros(self._sim.action_dim)
+        if self._sim.robots[0].gripper.dof:
+            idle[-1] = -1.0
+        for _ in range(_SETTLE):
+            self._sim.step(idle)
 
     def _step_simulation(self, action: npt.NDArray[np.float32]) -> bool:
         self._sim.step(action)

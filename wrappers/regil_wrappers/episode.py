@@ -89,11 +89,8 @@ class Episode:
         if self._first is None:
             raise ValueError("there is no picture yet: call reset() of the environment")
         if not self._registered:
-            among = None
-            if self.frames.hand_starts_elsewhere:  # it would be what has moved
-                recorded = self.frames.recorded
-                among = ~self._arm_of(len(recorded) // 2)
-            self._displacement = found = register(self.frames.recorded_first, self._first, among)
+            first = self.frames.recorded_first
+            self._displacement = found = register(first, self._first, self._without_arm)
             self._registered = True
             if found is not None and any(found.camera) and not self._said_camera:
                 self._said_camera = True
@@ -120,8 +117,10 @@ class Episode:
             raise ValueError("there is no picture yet: call reset() of the environment")
         if self._taken is None:
             self._taken = taken_up(self.frames.recorded, grasp)
-        taken, among = self._taken, None
-        if near is not None:
+        taken, among = self._taken, self._without_arm
+        if near is None:
+            taken = taken if among is None else taken & among
+        else:
             arm = self._arm_of(grasp)
             at_grasp, at_end = near
             taken = taken & self._round(at_grasp, _TAKEN) & ~arm
@@ -130,6 +129,13 @@ class Episode:
                 at_end = np.array([xs.mean(), ys.mean()]) + at_end - at_grasp
             among = (self._round(at_grasp, _TAKEN) | self._round(at_end, _PLACE)) & ~arm
         return register_apart(self.frames.recorded_first, self._first, taken, among)
+
+    @property
+    def _without_arm(self) -> NDArray[np.bool_] | None:
+        """The pixels that count where the arm starts elsewhere: it would be what has moved."""
+        if not self.frames.hand_starts_elsewhere:
+            return None
+        return ~self._arm_of(len(self.frames.recorded) // 4)
 
     def _arm_of(self, grasp: int) -> NDArray[np.bool_]:
         if grasp not in self._arms:
