@@ -13,12 +13,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import CSVOutputFormat
 from stable_baselines3.common.vec_env import VecEnv
 
 from regil_sb3.checkpoint.generations import Generations
 from regil_sb3.files import replacing
 from regil_sb3.model_file import checked_model
+from regil_sb3.watch import require_finite_parameters
 
 
 def refuse_finished(run: Path) -> None:
@@ -34,7 +34,12 @@ def refuse_finished(run: Path) -> None:
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:
-    """Save a model; the old file stays until the new one is complete."""
+    """Save a model; the old file stays until the new one is complete.
+
+    Raises:
+        FloatingPointError: a parameter is not finite; the old file stays.
+    """
+    require_finite_parameters(model)
     with replacing(path) as file:
         model.save(file)
 
@@ -73,6 +78,19 @@ def load_calibration(env: VecEnv, path: Path) -> bool:
         raise ValueError(f"{path} is damaged ({error}): remove it") from error
     env.env_method("set_calibration", found)
     return True
+
+
+def refuse_removed(run: Path, step: int) -> None:
+    """End learning where its folder has gone: nothing could go on from it.
+
+    Raises:
+        FileNotFoundError: the folder, or its settings, are not there.
+    """
+    if not (run / "config.yaml").exists():
+        raise FileNotFoundError(
+            f"{run} was removed, or can no longer be read, at step {step}: training stopped, and "
+            "cannot go on without the folder"
+        )
 
 
 def checkpoints_of(run: Path) -> Path:
@@ -114,18 +132,6 @@ def locked(run: Path) -> Iterator[None]:
         file.write(f"{os.getpid()}\n")
         file.flush()
         yield
-
-
-class AppendingCSV(CSVOutputFormat):
-    """SB3's CSV log, which goes on where an earlier part of the run stopped."""
-
-    def __init__(self, path: Path) -> None:
-        old = path.read_text(encoding="utf-8") if path.exists() else ""
-        super().__init__(str(path))
-        if old:
-            self.keys = old.splitlines()[0].split(",")
-            self.file.write(old)
-            self.file.flush()
 
 
 def best_so_far(log: Path) -> float:

@@ -517,6 +517,7 @@ class TD3BC(SafeLoad, TD3):
             self._require_finite("BC loss", loss.item())
             self.actor.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
+            self._require_finite_gradient("actor", self.actor)
             self.actor.optimizer.step()
             share = max(self.tau, _AVERAGED / (done + _AVERAGED))
             polyak_update(self.actor.parameters(), self.actor_target.parameters(), share)
@@ -532,6 +533,10 @@ class TD3BC(SafeLoad, TD3):
                 "training stopped, the model saved last is untouched; a lower learning_rate or "
                 f"reward_scale (now {self.used_reward_scale:g}) may help"
             )
+
+    def _require_finite_gradient(self, name: str, network: th.nn.Module) -> None:
+        sums = [p.grad.sum() for p in network.parameters() if p.grad is not None]
+        self._require_finite(f"{name}'s gradient", th.stack(sums).sum().item())
 
     def _number_of_updates(self, gradient_steps: int | float) -> int:
         """Turn updates per transition (a float) into whole updates, keeping the remainder."""
@@ -598,6 +603,7 @@ class TD3BC(SafeLoad, TD3):
             self._require_finite("critic loss", critic_losses[-1])
             self.critic.optimizer.zero_grad()
             critic_loss.backward()  # type: ignore[no-untyped-call]
+            self._require_finite_gradient("critic", self.critic)
             self.critic.optimizer.step()
 
             # Delayed actor, Eq. 4
@@ -628,6 +634,7 @@ class TD3BC(SafeLoad, TD3):
                 self._require_finite("actor loss", actor_losses[-1])
                 self.actor.optimizer.zero_grad()
                 actor_loss.backward()  # type: ignore[no-untyped-call]
+                self._require_finite_gradient("actor", self.actor)
                 self.actor.optimizer.step()
 
             if self._n_updates % self.policy_delay == 0:

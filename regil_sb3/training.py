@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import warnings
 from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
@@ -21,7 +22,7 @@ import numpy as np
 from regil_wrappers import Demonstration
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 from tqdm import tqdm
 
@@ -38,9 +39,9 @@ from regil_sb3.evaluation import (
     policy_act,
 )
 from regil_sb3.files import replacing
+from regil_sb3.logs import AppendingCSV, Forgiving
 from regil_sb3.report.success_films import save_films
 from regil_sb3.run_folder import (
-    AppendingCSV,
     best_so_far,
     checkpoints_of,
     forget_checkpoints,
@@ -48,12 +49,14 @@ from regil_sb3.run_folder import (
     load_calibration,
     locked,
     refuse_finished,
+    refuse_removed,
     save_calibration,
     save_model,
     steps_learned,
 )
 from regil_sb3.settings import ALGOS, Settings
 from regil_sb3.td3bc import TD3BC
+from regil_sb3.watch import Watch
 
 Learner = TD3BC | BAKU
 
@@ -107,9 +110,9 @@ class TrainingCallback(BaseCallback):
     selection seeds; each replaces the old file at once, so that a failed save loses nothing.
     """
 
-    def __init__(self, run: Path, env: VecEnv, every: int, episodes: int) -> None:
+    def __init__(self, run: Path, env: VecEnv, every: int, episodes: int, watch: Watch) -> None:
         super().__init__()
-        self.run = run
+        self.run, self.watch = run, watch
         self.eval_env = env
         self.every, self.episodes = every, episodes
         self.best = best_so_far(run / "progress.csv")
@@ -130,6 +133,7 @@ class TrainingCallback(BaseCallback):
         return self.model
 
     def _on_rollout_start(self) -> None:
+        refuse_removed(self.run, self.num_timesteps)
         if self._first and getattr(self.model, "pretrained", False):
             save_calibration(self.training_env, self.run / "calibration.json")
             self._evaluate()
@@ -157,9 +161,10 @@ class TrainingCallback(BaseCallback):
         success = f"{np.mean(recent):.2f}" if recent else "-"
         phase = "guide acts" if model.in_warmup else "policy acts"
         best = f", best {self.best:.2f}" if self.best >= 0 else ""
+        warned = f", warned of {', '.join(self.watch.said)}" if self.watch.said else ""
         self._bar.set_description_str(phase, refresh=False)
         self._bar.set_postfix_str(
-            f"success {success}{best}, {model.success_buffer.episodes} episodes kept"
+            f"success {success}{best}, {model.success_buffer.episodes} episodes kept{warned}"
         )
 
     def _evaluate(self) -> None:
@@ -271,14 +276,20 @@ def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> N
                 f"{run} has no checkpoint to go on from: it begins anew at step 0", stacklevel=3
             )
         log.unlink(missing_ok=True)
+        (run / "warnings.jsonl").unlink(missing_ok=True)
     every = max(settings.steps // 6, 1)
     # The callback reads the log before it is reopened
-    callback = TrainingCallback(run, eval_env, every, settings.eval_episodes)
-    formats = [AppendingCSV(log), TensorBoardOutputFormat(str(run))]
+    watch = Watch(run / "warnings.jsonl")
+    callback = TrainingCallback(run, eval_env, every, settings.eval_episodes, watch)
+    formats: list[KVWriter] = [
+        Forgiving(log.name, lambda: AppendingCSV(log)),
+        Forgiving("TensorBoard's log", lambda: TensorBoardOutputFormat(str(run))),
+    ]
     model.set_logger(Logger(str(run), formats))
-    both: list[BaseCallback] = [callback] if checkpoints is None else [callback, checkpoints]
+    callbacks: list[BaseCallback] = [watch, callback]
+    callbacks += [] if checkpoints is None else [checkpoints]
     try:
-        model.learn(settings.steps - done, both, reset_num_timesteps=done == 0)
+        model.learn(settings.steps - done, callbacks, reset_num_timesteps=done == 0)
         save_model(model, run / "model.zip")
         forget_checkpoints(run)
     except KeyboardInterrupt:
@@ -288,10 +299,14 @@ def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> N
     finally:
         if checkpoints is not None:
             checkpoints.close()
-        if isinstance(model, TD3BC):
-            save_films(model.success_buffer, run / "success_buffer.npz")
+        watch.close()
         callback.close()
         model.logger.close()
+        if isinstance(model, TD3BC):
+            try:
+                save_films(model.success_buffer, run / "success_buffer.npz")
+            except OSError as error:  # not worth more than the error that is under way
+                print(f"success_buffer.npz is not saved: {error}", file=sys.stderr)
 
 
 def _new_model(settings: Settings, demo: Demonstration, env: VecEnv) -> Learner:

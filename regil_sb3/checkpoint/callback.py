@@ -25,6 +25,7 @@ from regil_sb3 import __version__
 from regil_sb3.checkpoint.generations import Generations
 from regil_sb3.checkpoint.learner_state import check_can_be_kept, learner_state, load_learner_state
 from regil_sb3.td3bc import TD3BC
+from regil_sb3.watch import require_finite_parameters
 
 __all__ = ["CheckpointCallback", "Preempted"]
 
@@ -148,8 +149,10 @@ class CheckpointCallback(BaseCallback):
 
         Raises:
             OSError: it could not be written; the earlier ones are as they were.
+            FloatingPointError: a parameter is not finite; likewise.
         """
         assert isinstance(self.model, TD3BC)
+        require_finite_parameters(self.model)
         has_log = self.log is not None and self.log.exists()
         self._saving = True
         try:

@@ -1,7 +1,7 @@
 """What a run folder holds, read without running anything of it.
 
 * ``RunContents`` - what could be read, and lines about what could not
-* ``read_run``
+* ``read_run``, and ``read_warnings`` - of one file of it
 * ``column``, ``successes`` - values of a log, outcomes of an evaluation
 """
 
@@ -21,7 +21,16 @@ from regil_wrappers import Demonstration
 
 from regil_sb3.report.success_films import SuccessFilms, load_films
 
-__all__ = ["STEPS", "Rows", "RunContents", "column", "number", "read_run", "successes"]
+__all__ = [
+    "STEPS",
+    "Rows",
+    "RunContents",
+    "column",
+    "number",
+    "read_run",
+    "read_warnings",
+    "successes",
+]
 
 STEPS = "time/total_timesteps"
 _MARKS = ("config.yaml", "progress.csv", "evaluation.json")
@@ -42,6 +51,7 @@ class RunContents:
         episode: ``episode.hdf5``.
         kept: ``success_buffer.npz``.
         calibration: ``calibration.json``.
+        warnings: ``warnings.jsonl``, what `regil_sb3.watch` has said.
         missing: a line for each file that is not there, though a run has one, or cannot be read.
     """
 
@@ -53,6 +63,7 @@ class RunContents:
     episode: Demonstration | None
     kept: SuccessFilms | None
     calibration: dict[str, Any] | None
+    warnings: list[dict[str, Any]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
 
     @property
@@ -97,6 +108,7 @@ def read_run(run: Path | str) -> RunContents:
         episode=read("episode.hdf5", Demonstration.load),
         kept=read("success_buffer.npz", load_films, optional=True),
         calibration=read("calibration.json", _json, optional=True),
+        warnings=read("warnings.jsonl", read_warnings, optional=True) or [],
         missing=missing,
     )
 
@@ -123,6 +135,23 @@ def _progress(path: Path) -> Rows:
             for row in csv.DictReader(lines)
         ]
     return [row for row in rows if STEPS in row]
+
+
+def read_warnings(file: Path) -> list[dict[str, Any]]:
+    """The warnings of a run, in the order in which they came; broken lines are left out.
+
+    Args:
+        file: that a `Watch` has written.
+    """
+    found = []
+    for line in file.read_text("utf-8", errors="replace").splitlines() if file.is_file() else []:
+        try:
+            value = json.loads(line)
+        except (json.JSONDecodeError, RecursionError):
+            continue
+        if isinstance(value, dict) and {"step", "kind", "text"} <= value.keys():
+            found.append(value)
+    return found
 
 
 def number(value: Any) -> float | None:

@@ -77,7 +77,12 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
     if not rows:
         missing.append("no training progress has been logged")
 
+    said = "".join(
+        f"<li>step {html.escape(str(w['step']))}: {html.escape(str(w['text']))}</li>"
+        for w in found.warnings
+    )
     left = [
+        card("Warnings", f"<ul>{said}</ul>" if said else "", "missing"),
         card("Success over steps", _success_chart(rows, results, evaluation)),
         card("Episodes", _strips(results, evaluation)),
         card("What the guide sees", seen),

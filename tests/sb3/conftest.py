@@ -42,10 +42,8 @@ def libero_assets() -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder of `regil train` in seconds; tests leave it as they found it."""
-    folder = tmp_path_factory.mktemp("runs")
+def toy_words(folder: Path) -> list[str]:
+    """Of a `regil train` in seconds, whose run folder is ``folder / "run"``."""
     toy_env.record().save(folder / "reach.hdf5")
     tiny = {"correction": "none", "register": "false", "disturbance": 0, "warmup_steps": 25,
             "learning_starts": 10, "bc_pretrain_steps": 2, "buffer_size": 200, "batch_size": 4,
@@ -54,7 +52,20 @@ def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words += ["--out", str(folder / "run"), "--steps", "200", "--episodes", "2"]
     for key, value in tiny.items():
         words += ["--set", f"{key}={value}"]
+    return words
+
+
+@pytest.fixture
+def words(tmp_path: Path) -> list[str]:
+    """Of a `regil train` whose run folder is ``tmp_path / "run"``."""
+    return toy_words(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder of `regil train` in seconds; tests leave it as they found it."""
+    folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "BC_UPDATES", 3)
-        assert main(words) == 0
+        assert main(toy_words(folder)) == 0
     return folder / "run"
