@@ -147,7 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument(
         "table",
         help="rendering, retrieval, ranking, guide, success-buffer, latency, memory, index, "
-        "throughput; baselines, ablations, rewards (training runs)",
+        "throughput, faults; baselines, ablations, rewards (training runs)",
     )
     bench.add_argument(
         "--tasks",
@@ -166,7 +166,7 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--dims", type=int, help="memory, index: of the embeddings (384)")
     bench.add_argument("--plot", metavar="FILE", help="memory: draw it")
     bench.add_argument("--methods", nargs="+", metavar="NAME", help="training runs: of these alone")
-    bench.add_argument("--out", help="training runs: where they are kept (bench)")
+    bench.add_argument("--out", help="training runs, faults: where they are kept (bench; faults)")
     bench.add_argument(
         "--dry-run",
         action="store_true",
@@ -174,6 +174,8 @@ def _parser() -> argparse.ArgumentParser:
         help="training runs: say which, and for how long",
     )
     bench.add_argument("--workers", type=int, help="training runs: so many at a time (1)")
+    for part in ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers"):
+        bench.add_argument(f"--{part}", type=int, metavar="N", help="faults: so many (all parts)")
     bench.add_argument("--ray", metavar="ADDRESS", help="training runs: on a Ray cluster, or local")
     return parser
 

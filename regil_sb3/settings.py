@@ -38,6 +38,19 @@ _OWN = (
 )
 
 
+# PyYAML lets numbers' and dates' own errors through
+_UNREADABLE = (
+    OSError,
+    yaml.YAMLError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    ArithmeticError,
+    RecursionError,
+)
+
+
 @dataclass
 class Settings:
     """Everything needed to make a run again; ``config.yaml`` of a run folder.
@@ -87,7 +100,7 @@ class Settings:
             read = yaml.safe_load(path.read_text(encoding="utf-8"))
             read = {"algo": "td3bc", **read}  # which older runs do not say
             return cls(**{name: read[name] for name in cls.__dataclass_fields__})
-        except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
+        except _UNREADABLE as error:
             raise ValueError(
                 f"{path.parent} is not a run folder of `regil train` ({path.name}: {error!r})"
             ) from error

@@ -3,5 +3,7 @@
 * ``tables`` - the command: which tables there are, and what each compares
 * ``guide``, ``rewards``, ``latency``, ``memory``, ``throughput`` - measured at once
 * ``run_tables`` - tables made of many training runs, and ``runs``, which makes each run once
+* ``faults`` - kills, broken disks, hostile files: ``lives``, ``disk_faults``, ``hostile``
+* ``toy`` - a learner that lives for seconds
 * ``peers`` - other packages' alignments; ``machine``, ``timing`` - what it ran on, and how long
 """

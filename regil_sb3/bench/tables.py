@@ -188,11 +188,23 @@ def _compare(
 
 TABLES: dict[str, Callable[[], list[Row]]] = {"rendering": rendering, "retrieval": retrieval}
 """Tables by name."""
-_ROOMS = ("ranking", "guide", "success-buffer", "latency", "memory", "index", "throughput")
+_ROOMS = (
+    "ranking",
+    "guide",
+    "success-buffer",
+    "latency",
+    "memory",
+    "index",
+    "throughput",
+    "faults",
+)
+FAULTS = ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers")
+"""Parts of the table "faults", and the options that count them."""
 _OPTIONS = {
     "latency": ("encoders", "frames"),
     "memory": ("frames", "dims", "plot"),
     "index": ("frames", "dims"),
+    "faults": ("out", *FAULTS),
 }
 
 
@@ -202,7 +214,8 @@ def main(table: str, **options: Any) -> list[Row]:
     Args:
         table: one of `TABLES`, "ranking" (`regil_sb3.bench.rewards`), "guide" or "success-buffer"
             (`regil_sb3.bench.guide`), "latency" (`regil_sb3.bench.latency`), "memory" or "index"
-            (`regil_sb3.bench.memory`), "throughput" (`regil_sb3.bench.throughput`), or one of
+            (`regil_sb3.bench.memory`), "throughput" (`regil_sb3.bench.throughput`), "faults"
+            (`regil_sb3.bench.faults`), or one of
             `regil_sb3.bench.run_tables.LEARNING`.
         **options: the table's own.
 
@@ -244,6 +257,11 @@ def main(table: str, **options: Any) -> list[Row]:
         from regil_sb3.bench import throughput
 
         throughput.main()
+        return []
+    if table == "faults":
+        from regil_sb3.bench import faults
+
+        faults.main(**options)
         return []
     if table == "ranking":
         from regil_sb3.bench import rewards

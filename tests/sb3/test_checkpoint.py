@@ -20,9 +20,10 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
-from toy import Reach, demonstration
+from toy import Reach
 
-from regil_sb3 import TD3BC
+from regil_sb3.bench import toy as toy_module
+from regil_sb3.bench.toy import STEPS, flat, new_model, toy
 from regil_sb3.checkpoint import (
     CheckpointCallback,
     Preempted,
@@ -30,35 +31,6 @@ from regil_sb3.checkpoint import (
     callback,
     open_episode,
 )
-from regil_sb3.checkpoint.learner_state import learner_state
-
-STEPS = 200
-
-
-def toy(n_envs=1, replayable=True, **kwargs):
-    def one():
-        env = Reach(**kwargs)
-        return ReplayableEpisode(env) if replayable else env
-
-    return VecFrameStack(DummyVecEnv([one] * n_envs), 2)
-
-
-def new_model(env, policy="CnnPolicy", **changes):
-    settings = {
-        "demo": demonstration(),
-        "buffer_size": 150,
-        "learning_starts": 20,
-        "batch_size": 8,
-        "warmup_steps": 60,
-        "guide_again": 0.5,
-        "bc_pretrain_steps": 5,
-        "bc_schedule": "success",
-        "keep_own_successes": True,
-        "success_buffer_size": 80,
-        "seed": 0,
-        "device": "cpu",
-    }
-    return TD3BC(policy, env, **{**settings, **changes})
 
 
 def test_the_examples_run(tmp_path):
@@ -83,17 +55,6 @@ class KillAt(BaseCallback):
         return True
 
 
-def flat(tree, at=""):
-    if isinstance(tree, dict):
-        for key, value in tree.items():
-            yield from flat(value, f"{at}/{key}")
-    elif isinstance(tree, list | tuple):
-        for i, value in enumerate(tree):
-            yield from flat(value, f"{at}/{i}")
-    elif not at.endswith("/t"):  # Monitor's seconds
-        yield at, np.asarray(getattr(tree, "rows", tree))
-
-
 def assert_same(ended, never_killed):
     a, b = dict(flat(ended)), dict(flat(never_killed))
     assert a.keys() == b.keys()
@@ -103,17 +64,14 @@ def assert_same(ended, never_killed):
 
 def live(folder, env, kill_at=None, every=23, **changes):
     """One life of a process: its model's state at the end, or None where it was killed."""
-    model = new_model(env, **changes)
-    checkpoints = CheckpointCallback(folder, steps=every)
-    done = checkpoints.restore(model)
-    callbacks = [checkpoints] + ([] if kill_at is None else [KillAt(done + kill_at)])
+
+    def killer(done):
+        return () if kill_at is None else [KillAt(done + kill_at)]
+
     try:
-        model.learn(STEPS - done, callbacks, reset_num_timesteps=done == 0)
-        return learner_state(model)
+        return toy_module.live(folder, env, every, killer, **changes)
     except Killed:
         return None
-    finally:
-        checkpoints.close()
 
 
 @pytest.mark.parametrize(
@@ -344,13 +302,9 @@ def test_a_second_signal_ends_a_save_that_hangs(tmp_path, monkeypatch):
 
 CHILD = """
 import sys
-from test_checkpoint import live, toy, learner_state, flat
-state = live(sys.argv[1], toy(), every=9)
-import hashlib
-h = hashlib.sha256()
-for at, array in sorted(flat(state), key=lambda pair: pair[0]):
-    h.update(f"{at} {array.dtype} {array.tolist()!r}".encode())
-print(h.hexdigest())
+from pathlib import Path
+from regil_sb3.bench.toy import digest, live, toy
+print(digest(live(Path(sys.argv[1]), toy(), 9)))
 """
 
 

@@ -4,69 +4,23 @@ from __future__ import annotations
 
 import copy
 import errno
-import os
 import shutil
 import warnings
 
 import numpy as np
 import pytest
-import torch as th
 
+from regil_sb3.bench import disk_faults
+from regil_sb3.bench.disk_faults import ROWS, Faults, Learner, same
 from regil_sb3.checkpoint import generations
 from regil_sb3.checkpoint.generations import Generations
 from regil_sb3.checkpoint.snapshot import Ring
 
-ROWS = 40
-
-
-class Learner:
-    """Something that changes, most of it little by little."""
-
-    def __init__(self):
-        self.rng = np.random.default_rng(0)
-        self.ring = np.zeros((ROWS, 3, 1000), np.uint8)
-        self.written = 0
-        self.step = 0
-
-    def learn(self, rows=7):
-        self.step += 1
-        for _ in range(rows):
-            self.ring[self.written % ROWS] = self.rng.integers(0, 256, (3, 1000))
-            # the row after the newest holds something, too
-            self.ring[(self.written + 1) % ROWS] = 7
-            self.written += 1
-
-    def tree(self):
-        used = min(self.written + 1, ROWS)
-        return {
-            "step": self.step,
-            "ring": Ring(self.ring[:used], self.written, ROWS),
-            "weights": {0: th.full((3, 4), self.step + 0.5), "m": (1, [2.5, None, "text", True])},
-            "seen": np.arange(24.0).reshape(2, 3, 4).transpose(0, 2, 1),
-            "big": np.full(5_000, self.step, np.int64),
-            "one": np.float32(0.1),
-            "whole": 2**100,
-        }
-
 
 @pytest.fixture(autouse=True)
-def small_blocks(monkeypatch):
-    monkeypatch.setattr(generations, "BLOCK", 8_000)
-    monkeypatch.setattr(generations, "SMALL", 1_000)
-
-
-def same(loaded, tree):
-    if isinstance(tree, dict):
-        return loaded.keys() == tree.keys() and all(same(loaded[k], tree[k]) for k in tree)
-    if isinstance(tree, Ring):
-        return np.array_equal(loaded, tree.rows)
-    if isinstance(tree, np.ndarray | th.Tensor):
-        return (
-            type(loaded) is type(tree)
-            and loaded.dtype == tree.dtype
-            and bool((loaded == tree).all())
-        )
-    return type(loaded) is type(tree) and loaded == tree
+def small_blocks():
+    with disk_faults.small_blocks():
+        yield
 
 
 def test_what_is_saved_is_loaded_and_only_what_changed_is_written(tmp_path):
@@ -98,65 +52,12 @@ def test_a_ring_may_have_been_overwritten_by_any_number_of_rows(since, tmp_path)
     assert same(Generations(tmp_path).load(), learner.tree())
 
 
-class Faults:
-    """Counts the calls that a save makes of the system, and lets one of them go wrong."""
-
-    CALLS = ("write", "fsync", "rename")
-
-    def __init__(self, monkeypatch):
-        self.calls, self.at, self.how = 0, -1, ""
-        for name in self.CALLS:
-            monkeypatch.setattr(os, name, self.around(getattr(os, name), name))
-
-    def around(self, call, name):
-        def faulty(*args, **kwargs):
-            self.calls += 1
-            if self.calls != self.at:
-                return call(*args, **kwargs)
-            if self.how == "killed":
-                raise KeyboardInterrupt
-            if self.how == "short" and name == "write":
-                return call(args[0], args[1][: len(args[1]) // 2])
-            if self.how == "torn" and name == "write":
-                call(args[0], args[1][: len(args[1]) // 2])
-                raise OSError(errno.ENOSPC, "No space left on device")
-            if self.how == "flipped" and name == "write":
-                data = bytearray(args[1])
-                data[len(data) // 3] ^= 16
-                return call(args[0], bytes(data))
-            if self.how in ("ENOSPC", "EIO"):
-                raise OSError(getattr(errno, self.how), "fault")
-            return call(*args, **kwargs)
-
-        return faulty
-
-
-@pytest.mark.parametrize("how", ["ENOSPC", "EIO", "killed", "short", "torn", "flipped"])
-def test_a_fault_at_every_call_of_a_save_leaves_one_that_loads(how, tmp_path, monkeypatch):
-    learner = Learner()
-    faults = Faults(monkeypatch)
-    faults.how = how
-    saver = Generations(tmp_path)
-    learner.learn()
-    saver.save(learner.tree())
-    good, failed = copy.deepcopy(learner.tree()), 0
-    faults.calls = faults.at = 0
-    while faults.at <= faults.calls:  # until no call was left to go wrong
-        faults.calls, faults.at = 0, faults.at + 1
-        learner.learn(2)
-        try:
-            saver.save(learner.tree())
-            good = copy.deepcopy(learner.tree())
-        except (OSError, KeyboardInterrupt):
-            failed += 1
-        loaded = Generations(tmp_path).load()
-        if loaded["step"] == learner.step:  # renamed, and then a fault: it is there all the same
-            good = copy.deepcopy(learner.tree())
-        assert same(loaded, good)
-        if how == "killed":
-            saver = Generations(tmp_path)
+@pytest.mark.parametrize("how", disk_faults.HOW)
+def test_a_fault_at_every_call_of_a_save_leaves_one_that_loads(how, tmp_path):
+    calls, failed, wrong = disk_faults.at_every_call(how, tmp_path)
+    assert not wrong
+    assert calls > 10
     assert (failed == 0) == (how == "short")
-    assert faults.at > 10
 
 
 @pytest.mark.parametrize("name", ["state.json", "small.bin", "block"])
@@ -273,16 +174,16 @@ def test_a_generation_that_cannot_be_read_now_keeps_its_blocks(tmp_path, monkeyp
     assert same(Generations(tmp_path).load()["big"], good["big"])
 
 
-def test_a_failed_save_gives_its_room_back(tmp_path, monkeypatch):
+def test_a_failed_save_gives_its_room_back(tmp_path):
     learner, saver = Learner(), Generations(tmp_path)
     learner.learn(30)
     saver.save(learner.tree())
     before = set((tmp_path / "blocks").iterdir())
-    faults = Faults(monkeypatch)
-    faults.how, faults.at = "torn", 10
     learner.learn(9)
-    with pytest.raises(OSError, match="No space"):
-        saver.save(learner.tree())
+    with Faults("torn") as faults:
+        faults.at = 10
+        with pytest.raises(OSError, match="No space"):
+            saver.save(learner.tree())
     assert set((tmp_path / "blocks").iterdir()) == before
     saver.save(learner.tree())
     assert same(Generations(tmp_path).load(), learner.tree())

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 import io
-import json
 import os
-import pickle
 import zipfile
 
-import cloudpickle
-import gymnasium as gym
 import numpy as np
 import pytest
 from test_td3bc import small
 from toy import demonstration, stacked
 
 from regil_sb3 import TD3BC
-from regil_sb3.bc_schedule import BySuccess
+from regil_sb3.bench.hostile import KEYS, Call, pickles, with_pickle
 
 
 @pytest.fixture(scope="module")
@@ -29,68 +24,11 @@ def saved(tmp_path_factory):
     return path
 
 
-def with_pickle(saved, path, pickled, key="lr_schedule"):
-    """The same model, with this in place of one of the things that SB3 pickles."""
-    with zipfile.ZipFile(saved) as old, zipfile.ZipFile(path, "w") as new:
-        for name in old.namelist():
-            content = old.read(name)
-            if name == "data":
-                data = json.loads(content)
-                assert key in data
-                data[key] = {":type:": "x", ":serialized:": base64.b64encode(pickled).decode()}
-                content = json.dumps(data).encode()
-            new.writestr(name, content)
-    return path
-
-
-class Call:
-    """Pickles as a call."""
-
-    def __init__(self, function, *arguments):
-        self.called = (function, arguments)
-
-    def __reduce__(self):
-        return self.called
-
-
-def touch(path):
-    return f"open({str(path)!r}, 'w').close()"
-
-
-def pickles(marker):
-    command = f"touch {marker}"
-    line = touch(marker)
-    yield "os.system", pickle.dumps(Call(os.system, command))
-    yield "exec", pickle.dumps(Call(exec, line))
-    yield "eval", pickle.dumps(Call(eval, line))
-    yield "getattr", pickle.dumps(Call(getattr, dict, "fromkeys"))
-    yield "import", pickle.dumps(Call(__import__, "antigravity"))
-    yield "cloudpickle", cloudpickle.dumps(lambda _: os.system(command))
-    yield "a class of its own", cloudpickle.dumps(type("Net", (), {"__call__": lambda self: 1}))
-    yield "in a known one", pickle.dumps({"state": [Call(os.system, command)]})
-    for protocol in range(3):
-        yield f"protocol {protocol}", pickle.dumps(Call(os.system, command), protocol)
-    yield "INST", b"(S'" + command.encode() + b"'\nios\nsystem\n."
-    yield "OBJ", b"(cos\nsystem\nS'" + command.encode() + b"'\no."
-    yield "dotted", b"\x80\x04\x8c\x0bcollections\x8c\x0edeque.__init__\x93."
-    yield "EXT", b"\x80\x02\x82\x01."
-    yield "persistent", b"Pos.system\n."
-    yield "a class changed", pickle.dumps(BySuccess)[:-1] + b"}\x8c\x05shareK\x01sb."
-    yield "huge", pickle.dumps(Call(gym.spaces.Box, 0, 1, (10**7, 10**7)))
-    yield "huge array", pickle.dumps(Call(np.zeros, 10**13))
-    wide = Call(np.float64(0).__reduce__()[0], np.dtype("V100000000"))
-    yield "huge number", pickle.dumps(wide)
-    yield "endless", b"\x80\x04" + b"(" * 10**6 + b"."
-    yield "truncated", pickle.dumps(BySuccess(0.5))[:-9]
-    yield "nothing", b""
-    yield "text", b"hello"
-
-
 NAMES = [name for name, _ in pickles("x")]
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("key", ["lr_schedule", "_by_success", "observation_space"])
+@pytest.mark.parametrize("key", KEYS)
 def test_what_a_model_does_not_need_is_refused_in_one_line(saved, tmp_path, name, key):
     marker = tmp_path / "executed"
     path = with_pickle(saved, tmp_path / "hostile.zip", dict(pickles(marker))[name], key)

@@ -14,10 +14,11 @@ from made_run import run as made_run
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
-from test_checkpoint import At, new_model, toy
+from test_checkpoint import At
 from toy import Reach
 
 from regil_sb3 import watch as module
+from regil_sb3.bench.toy import new_model, toy
 from regil_sb3.checkpoint import CheckpointCallback
 from regil_sb3.report import write_report
 from regil_sb3.watch import Watch

@@ -10,11 +10,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from fuzz_formats import example, jpeg, lerobot_film, minari_arrow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from regil_wrappers import Demonstration, RetrievalRewardWrapper, formats
 from regil_wrappers.formats.changes import FLIPS
+from regil_wrappers.formats.fuzz import example, jpeg, lerobot_film, minari_arrow
 from toy_env import ToyReach
 
 DEMO = example()

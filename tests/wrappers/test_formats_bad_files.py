@@ -12,12 +12,12 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import fuzz_formats
 import h5py
 import numpy as np
 import pytest
-from fuzz_formats import example
 from regil_wrappers import Demonstration, formats
+from regil_wrappers.formats import fuzz
+from regil_wrappers.formats.fuzz import example
 
 DEMO = example()
 IMAGE = "data/demo_0/obs/agentview_image"
@@ -32,7 +32,7 @@ def refused(path: Path, message: str, **options: Any) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited as Linux does it")
 def test_damaged_files_in_a_process_that_may_not_grow() -> None:
-    counts, wrong = fuzz_formats.run(300)
+    counts, wrong = fuzz.run(300)
     assert not wrong
     assert counts["read"] + counts["refused"] == 300
     assert counts["refused"] > 100
@@ -42,7 +42,7 @@ def test_damaged_files_in_a_process_that_may_not_grow() -> None:
 @pytest.mark.timeout(1800)
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited as Linux does it")
 def test_thousands_of_damaged_files() -> None:
-    counts, wrong = fuzz_formats.run(5000, first=1000)
+    counts, wrong = fuzz.run(5000, first=1000)
     assert not wrong
     assert counts["read"] + counts["refused"] == 5000
 

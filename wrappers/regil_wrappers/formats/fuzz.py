@@ -1,10 +1,14 @@
 """Damaged files of every format, read in a process that may not grow.
 
-    python fuzz_formats.py COUNT [FIRST]
+    python -m regil_wrappers.formats.fuzz COUNT [FIRST]
 
 reads COUNT of them and says what became of them. Exit status 0: each was read or refused in one
 line. A crash of the interpreter, a file that takes over 20 seconds, or one that asks for more than
 512 MiB ends it.
+
+* ``run`` - the cases of any such worker, in a process of their own
+* ``limited`` - what that process does
+* ``damaged``, ``damaged_json`` - a file's content, damaged
 """
 
 from __future__ import annotations
@@ -17,11 +21,13 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
+import h5py  # type: ignore[import-untyped]
 import numpy as np
+
 from regil_wrappers import Demonstration, formats
 
 ROOM = 512 * 1024**2
@@ -29,6 +35,7 @@ SECONDS = 20
 
 
 def example(n: int = 6, side: int = 16) -> Demonstration:
+    """A demonstration of everything that formats hold."""
     rng = np.random.default_rng(0)
     coarse = rng.integers(0, 256, (n, 4, 4, 3), dtype=np.uint8)
     return Demonstration(
@@ -40,7 +47,8 @@ def example(n: int = 6, side: int = 16) -> Demonstration:
     )
 
 
-def jpeg(frame: np.ndarray) -> bytes:
+def jpeg(frame: np.ndarray[Any, np.dtype[np.uint8]]) -> bytes:
+    """A frame as a file."""
     from PIL import Image
 
     stream = io.BytesIO()
@@ -50,8 +58,10 @@ def jpeg(frame: np.ndarray) -> bytes:
 
 def minari_arrow(folder: Path, demo: Demonstration, storage: str) -> None:
     """As Minari stores an episode in arrow or parquet, `jpeg_encoding=False`."""
-    import pyarrow as pa
+    import pyarrow as pa  # type: ignore[import-untyped]
     from pyarrow import ipc, parquet
+
+    assert demo.actions is not None
 
     n = len(demo)
     flat = pa.FixedSizeListArray.from_arrays(demo.frames.reshape(-1), demo.frames[0].size)
@@ -77,7 +87,7 @@ def minari_arrow(folder: Path, demo: Demonstration, storage: str) -> None:
 
 def lerobot_film(folder: Path, demo: Demonstration, version: str) -> None:
     """As LeRobot stores an episode whose pictures are a film."""
-    import pyarrow.parquet as pq
+    import pyarrow.parquet as pq  # type: ignore[import-untyped]
 
     formats.write(demo, folder, "lerobot", version=version)
     info = json.loads((folder / "meta/info.json").read_text())
@@ -248,15 +258,8 @@ def one(case: int, made: dict[str, tuple[Path, str]], folder: Path) -> str:
         chosen = None if rng.random() < 0.3 else format
         formats.read(target, chosen, size=8 if rng.random() < 0.5 else None)
         return "read"
-    except (ValueError, FileNotFoundError) as error:
-        cause: BaseException | None = error
-        while cause is not None:
-            if isinstance(cause, MemoryError):
-                return f"over {ROOM} bytes: {error}"
-            cause = cause.__cause__
-        return "refused" if len(str(error).splitlines()) == 1 else f"not one line: {error}"
     except Exception as error:
-        return f"{type(error).__name__}: {error}"
+        return outcome(error)
     finally:
         if target.is_dir():
             shutil.rmtree(target)
@@ -264,36 +267,62 @@ def one(case: int, made: dict[str, tuple[Path, str]], folder: Path) -> str:
             target.unlink(missing_ok=True)
 
 
-def worker(first: int, count: int, folder: Path) -> None:
-    """Read the cases; the number of each is printed before it is read."""
+def outcome(error: Exception) -> str:
+    """What an error says of a reader: "refused" is one line of a kind that may be raised."""
+    if not isinstance(error, (ValueError, FileNotFoundError)):
+        return f"{type(error).__name__}: {error}"
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, MemoryError):
+            return f"over {ROOM} bytes: {error}"
+        cause = cause.__cause__
+    return "refused" if len(str(error).splitlines()) == 1 else f"not one line: {error}"
+
+
+def limited(first: int, count: int, case: Callable[[int], str]) -> None:
+    """Do the cases in a process that may not grow; the number of each is printed before it."""
     import resource
 
-    made = samples(folder)
-    for path, format in made.values():  # everything imported, every pool of memory begun
-        formats.read(path, format)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + ROOM
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    for case in range(first, first + count):
+    for number in range(first, first + count):
         signal.alarm(SECONDS)
-        print(case, end=" ", flush=True)
-        print(one(case, made, folder), flush=True)
+        print(number, end=" ", flush=True)
+        print(case(number), flush=True)
     signal.alarm(0)
     print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024, "MiB", flush=True)
 
 
-def run(count: int, first: int = 0) -> tuple[dict[str, int], list[str]]:
-    """Read `count` damaged files in another process.
+def worker(first: int, count: int, folder: Path) -> None:
+    """Read the cases."""
+    made = samples(folder)
+    for path, format in made.values():  # everything imported, every pool of memory begun
+        formats.read(path, format)
+    limited(first, count, lambda number: one(number, made, folder))
+
+
+def run(
+    count: int, first: int = 0, module: str = __spec__.name, kind: str = ""
+) -> tuple[dict[str, int], list[str]]:
+    """Do as many cases of a worker in another process.
+
+    Args:
+        count: of them.
+        first: number of the first.
+        module: whose worker it is.
+        kind: of its cases, where it has several.
 
     Returns:
         how many were read and refused, and a line for each that was neither.
     """
     counts = {"read": 0, "refused": 0}
     wrong = []
+    own = [kind] if kind else []
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(
-            [sys.executable, __file__, "--worker", str(first), str(count), folder],
+            [sys.executable, "-m", module, "--worker", *own, str(first), str(count), folder],
             capture_output=True,
             text=True,
             env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
@@ -303,9 +332,7 @@ def run(count: int, first: int = 0) -> tuple[dict[str, int], list[str]]:
         case, _, outcome = line.partition(" ")
         if outcome in counts:
             counts[outcome] += 1
-        elif case == "peak":
-            print(line)
-        else:
+        elif case != "peak":
             wrong.append(f"case {case}: {outcome or 'the interpreter ended'}")
     if done.returncode:
         wrong.append(f"exit status {done.returncode}: {done.stderr[-2000:]}")
