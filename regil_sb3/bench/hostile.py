@@ -111,14 +111,14 @@ def _read(read: Callable[[], Any], marker: Path, must_refuse: bool = True) -> st
 
 
 def _checkpoints(folder: Path) -> Callable[[int], str]:
-    disk_faults.small_blocks().__enter__()
     source = folder / "whole"
     learner, saver = disk_faults.Learner(), Generations(source)
     trees = []
     for _ in range(2):
         learner.learn(20)
         trees.append({**learner.tree(), "ring": learner.tree()["ring"].rows.copy()})
-        saver.save(learner.tree())
+        with disk_faults.small_blocks():
+            saver.save(learner.tree())
 
     def case(number: int) -> str:
         rng = np.random.default_rng(number)
