@@ -90,6 +90,7 @@ def convolutions():
         "channels last": ChannelsLast(SPACE),
         "space to depth": SpaceToDepth(SPACE),
         "bfloat16": ConvEncoder(SPACE, dtype="bfloat16"),
+        "torch.compile": th.compile(ConvEncoder(SPACE)),
     }
     forward = {n: lambda e=e: th.no_grad()(e)(batch.float() / 255) for n, e in networks.items()}
     both = {n: lambda e=e: e(batch.float() / 255).sum().backward() for n, e in networks.items()}
