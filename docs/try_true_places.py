@@ -34,7 +34,9 @@ def scene(env):
 
 def corrected(path, shifts, turned, turning):
     """(T, 3) action units: the path to where the places are now."""
+    # What is taken up is brought where it was brought; but the door (and what it turns) stays
     taken, brought = shifts[0], shifts[1] if len(shifts) > 1 else np.zeros(3)
+    brought = taken if turned is not None else brought
     places = np.stack([path.corrected(i, taken, brought) for i in range(len(path))])
     if turning:
         off = path.places - path.places[path.grasp]
@@ -53,7 +55,7 @@ def replay(env, goal, actions, home, turning, hand_turn):
     facts = env.unwrapped.metadata["regil"]
     unit, gripper, rotations = facts["step_cm"] / 100, -1, facts.get("rotation_dims", [])
     path = Path(np.clip(actions[:, :3].astype(float), -1, 1), actions[:, gripper])
-    turned = Rotation.from_rotvec([0, 0, turn - home[2]])
+    turned = Rotation.from_rotvec([0, 0, turn - home[2]]) if env.spec.id == DOOR else None
     way = corrected(path, (places - home[0]) / unit, turned, turning)
     turns = np.cumsum(actions[:, rotations], axis=0)
     if turning:
