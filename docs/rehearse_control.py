@@ -2,8 +2,9 @@
 
     python docs/rehearse_control.py TASK MINUTES [SEED]
 
-prints steps, missed deadlines, and the times of the control step (an observation to its action) and
-of the period, as ``docs/robot.md`` shows them. The demonstration is recorded first.
+prints steps, missed deadlines, the times of the control step (an observation to its action) and of
+the period, as ``docs/robot.md`` shows them, and the learner's memory, minute by minute. The
+demonstration is recorded first.
 """
 
 from __future__ import annotations
@@ -14,13 +15,29 @@ import tempfile
 import warnings
 
 import gymnasium as gym
+import psutil
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from regil_sb3 import process
 from regil_sb3.background import BackgroundTD3BC
 from regil_sb3.recording import record_expert
+
+
+class Memory(BaseCallback):
+    """MB of this process, once a minute of control, and how far the run is."""
+
+    def _on_training_start(self):
+        self.megabytes, self.robot = [], self.training_env.unwrapped.envs[0].unwrapped
+
+    def _on_step(self):
+        if self.n_calls % (60 * 30) == 0:
+            self.megabytes.append(round(psutil.Process().memory_info().rss / 1e6))
+            now = {"minute": len(self.megabytes), "updates": self.model._n_updates}
+            print(json.dumps({**now, **self.robot.times.summary()}), file=sys.stderr, flush=True)
+        return True
 
 
 def main(task: str, minutes: float, seed: int = 0) -> None:
@@ -51,10 +68,9 @@ def main(task: str, minutes: float, seed: int = 0) -> None:
             policy_kwargs={"shared_encoder": False, "q_trains_encoder": False},
             seed=seed,
         )
-        faults = []
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            model.learn(steps)
+            model.learn(steps, memory := Memory())
         faults = sorted({str(w.message) for w in caught if "stopped" in str(w.message)})
         out = {
             **robot.times.summary(),
@@ -63,6 +79,7 @@ def main(task: str, minutes: float, seed: int = 0) -> None:
             "recent_success": model.ep_success_buffer and sum(model.ep_success_buffer),
             "episodes": len(model.ep_success_buffer),
             "faults": faults,
+            "megabytes": memory.megabytes,
         }
         envs.close()
         print(json.dumps(out))
