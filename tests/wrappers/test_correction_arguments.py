@@ -122,6 +122,8 @@ def test_without_a_gripper(touch: Demonstration) -> None:
     env = RetrievalGuideWrapper(ToyCamera(), touch, correction="servo", gripper_dim="none")
     info = follow(env, 110)
     assert all(step["guide_action"][3] == 0 for step in info if step["guide"] == "calibration")
+    assert env.calibration() is None  # a robot is not kept waiting for it
+    env.reset()
     assert env.calibration() is not None
 
 

@@ -42,7 +42,8 @@ class Calibration:
     """Moves the hand along whole axes and the gripper once, as many as fit into an episode.
 
     Call `begin` in each episode until `over`, then ask `action` and give `step` the picture that
-    followed, until the episode ends or `over`.
+    followed, until the episode ends or `over`. Then `fit`, when the hand need not be told what to
+    do for most of a second.
 
     Args:
         size: (height, width) px of the pictures.
@@ -78,12 +79,12 @@ class Calibration:
         self._done: list[_Segment] = []
         self._at = self._wait = 0
         self._done_here, self._in_vain = False, 0
-        self.cameras: dict[int, Pinhole] = {}
+        self.cameras: dict[int, Pinhole] = {}  # after `fit`
         self.why = ""  # why there are no cameras, where there are none
 
     @property
     def over(self) -> bool:
-        """Whether all moves have been made: there are `cameras` then, or `why` says why not."""
+        """Whether all moves have been made, or are given up."""
         return not self._segments
 
     def begin(self) -> None:
@@ -125,49 +126,11 @@ class Calibration:
         self._at, self._done_here = 0, True
         if self._segments:
             self._segments[0].pictures = [picture.copy()]
+
+    def fit(self) -> None:
+        """Find the `cameras`, or say in `why` why there are none."""
+        if self.why:
             return
-        self._fit()
-        self._done = []
-
-    def lasting(self) -> dict[str, Any]:
-        """What stays when an episode ends, as numbers and arrays."""
-        return {"done": [s.pictures for s in self._done], "in_vain": self._in_vain}
-
-    def set_lasting(self, lasting: dict[str, Any]) -> None:
-        """Take over what `lasting` gave, before any move was made."""
-        for pictures in lasting["done"]:
-            self._done.append(self._segments.pop(0))
-            self._done[-1].pictures = list(pictures)
-        self._in_vain = lasting["in_vain"]
-
-    def _gripper_moves(self) -> _Segment:
-        turned = self._idle.copy()
-        i = self._gripper
-        turned[i] = self._low[i] + self._high[i] - turned[i]
-        actions = [turned] * self._settle + [self._idle] * self._settle
-        return _Segment(actions, [0, self._settle, 2 * self._settle], np.zeros((3, 3)))
-
-    def _axis_moves(self, axis: int) -> _Segment:
-        """To one side, back, to the other side, back."""
-        dim = self._dims[axis]
-        limit = float(min(-self._low[dim], self._high[dim]))
-        actions: list[Action] = []
-        marks, places = [0], [np.zeros(3)]
-        for goal in (1.0, 0.0, -1.0, 0.0):
-            place = np.zeros(3)
-            place[axis] = goal * self._length / 2
-            way = place[axis] - places[-1][axis]
-            while abs(way) > 1e-9:
-                action = self._idle.copy()
-                action[dim] = part = float(np.clip(way, -limit, limit))
-                actions.append(action)
-                way -= part
-            actions += [self._idle] * self._settle
-            marks.append(len(actions))
-            places.append(place)
-        return _Segment(actions, marks, np.stack(places))
-
-    def _fit(self) -> None:
         moves = [segment for segment in self._done if segment.places.any()]
         hand = _moves_most([segment.pictures for segment in moves])
         gripper = [segment for segment in self._done if not segment.places.any()]
@@ -210,6 +173,44 @@ class Calibration:
         # The better fit is tried first
         chosen = sorted((fits[mirror] for mirror in self._mirrors), key=lambda fit: fit.cost)
         self.cameras = {camera.mirror: camera for camera in chosen}
+
+    def lasting(self) -> dict[str, Any]:
+        """What stays when an episode ends, as numbers and arrays."""
+        return {"done": [s.pictures for s in self._done], "in_vain": self._in_vain}
+
+    def set_lasting(self, lasting: dict[str, Any]) -> None:
+        """Take over what `lasting` gave, before any move was made."""
+        for pictures in lasting["done"]:
+            self._done.append(self._segments.pop(0))
+            self._done[-1].pictures = list(pictures)
+        self._in_vain = lasting["in_vain"]
+
+    def _gripper_moves(self) -> _Segment:
+        turned = self._idle.copy()
+        i = self._gripper
+        turned[i] = self._low[i] + self._high[i] - turned[i]
+        actions = [turned] * self._settle + [self._idle] * self._settle
+        return _Segment(actions, [0, self._settle, 2 * self._settle], np.zeros((3, 3)))
+
+    def _axis_moves(self, axis: int) -> _Segment:
+        """To one side, back, to the other side, back."""
+        dim = self._dims[axis]
+        limit = float(min(-self._low[dim], self._high[dim]))
+        actions: list[Action] = []
+        marks, places = [0], [np.zeros(3)]
+        for goal in (1.0, 0.0, -1.0, 0.0):
+            place = np.zeros(3)
+            place[axis] = goal * self._length / 2
+            way = place[axis] - places[-1][axis]
+            while abs(way) > 1e-9:
+                action = self._idle.copy()
+                action[dim] = part = float(np.clip(way, -limit, limit))
+                actions.append(action)
+                way -= part
+            actions += [self._idle] * self._settle
+            marks.append(len(actions))
+            places.append(place)
+        return _Segment(actions, marks, np.stack(places))
 
 
 def _moves_most(pictures: list[list[Picture]]) -> Floats:

@@ -252,8 +252,7 @@ class Servo:
                 self._moving = False
                 return
             self._calibration.step(picture)
-            if self._calibration.over:
-                self._take_over(self._calibration)
+            self._moving = not self._calibration.over
             return
         if self._way.kind != "plain":
             delta = np.asarray(action, float)[self._dims]
@@ -281,8 +280,6 @@ class Servo:
         """The episode is over; what came of it counts where the guide chose every action."""
         if self._moving and self._followed and self._calibration is not None:
             self._calibration.end()
-            if self._calibration.over:
-                self._take_over(self._calibration)
         elif self._followed and not self._calibrated_here:
             if success:
                 self._way.won += 1
@@ -291,6 +288,22 @@ class Servo:
             if not self.why and (verdict := self._ways.verdict()):
                 self._say(verdict)
         self._followed = False  # once
+        self.settle()
+
+    def settle(self) -> None:
+        """Take over what calibration has shown, once all its moves have been made.
+
+        Between episodes: it takes most of a second, in which a robot would not be told what to do.
+        """
+        if self._calibration is None or not self._calibration.over:
+            return
+        calibration, self._calibration = self._calibration, None
+        calibration.fit()
+        self.cameras = calibration.cameras
+        self._ways = Ways(self.cameras, self.grasp is not None)
+        self._moving, self._way = False, self._ways.plain
+        if calibration.why:
+            self._say(f"{calibration.why}; the guide replays without correction")
 
     def state(self) -> dict[str, Any] | None:
         """What calibration found and which ways succeeded, as JSON values; None before that."""
@@ -424,14 +437,6 @@ class Servo:
     def _say(self, why: str) -> None:
         self.why = why
         warnings.warn(why, stacklevel=2)
-
-    def _take_over(self, calibration: Calibration) -> None:
-        self.cameras = calibration.cameras
-        self._ways = Ways(self.cameras, self.grasp is not None)
-        self._calibration, self._moving = None, False
-        self._way = self._ways.plain  # what is left of this episode
-        if calibration.why:
-            self._say(f"{calibration.why}; the guide replays without correction")
 
     def _begin_episode(self) -> None:
         self._moving = self._calibrated_here = False

@@ -75,6 +75,7 @@ class Guide:
         if self.servo is not None:
             if seed is not None:
                 self.servo.reseed(seed)
+            self.servo.settle()  # an episode may have been left, or resumed, after its last move
             if not self.servo.calibrated:
                 self.servo.reset()
                 return

@@ -229,7 +229,7 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
     def calibration(self) -> dict[str, Any] | None:
         """What a correcting guide has learned about camera and task, as JSON values.
 
-        None before its calibration is over, and without a correction.
+        None before the episode of its last calibration move is over, and without a correction.
         """
         return self._guide.calibration()
 
