@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from regil_wrappers import Demonstration, formats
 from regil_wrappers.formats import fuzz
+from regil_wrappers.formats.footer import claims
 from regil_wrappers.formats.fuzz import example
 
 DEMO = example()
@@ -36,6 +37,45 @@ def test_damaged_files_in_a_process_that_may_not_grow() -> None:
     assert not wrong
     assert counts["read"] + counts["refused"] == 300
     assert counts["refused"] > 100
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited as Linux does it")
+@pytest.mark.parametrize(
+    "case",
+    [
+        7885,  # an index of a parquet column that ended pyarrow's interpreter
+        9893,  # a film's description that claims 45 kB of its 173 bytes
+        25557,  # one that FFmpeg does not know yet
+        29623,  # a chunk of a PNG that claims gigabytes
+    ],
+)
+def test_damaged_files_that_once_were_too_much(case: int) -> None:
+    counts, wrong = fuzz.run(1, first=case)
+    assert not wrong
+    assert counts["refused"] == 1
+
+
+def test_claims_of_a_parquet_file(tmp_path: Path) -> None:
+    pyarrow, parquet = map(pytest.importorskip, ("pyarrow", "pyarrow.parquet"))
+    columns = {
+        "lists": [[1, 2], [3], None],
+        "structs": [{"x": 1, "y": "s"}] * 3,
+        "truths": [True, False, None],
+        "numbers": [1.5, 2.5, float("nan")],
+        **{f"more {i}": [i] * 3 for i in range(20)},
+    }
+    table = pyarrow.table({k: pyarrow.array(v) for k, v in columns.items()})
+    parquet.write_table(table, tmp_path / "a.parquet", row_group_size=1)
+    index = parquet.read_metadata(tmp_path / "a.parquet")
+    groups = [index.row_group(i) for i in range(index.num_row_groups)]
+    expected = [
+        (column.path_in_schema, column.num_values, column.total_uncompressed_size)
+        for column in (group.column(i) for group in groups for i in range(index.num_columns))
+    ]
+    with (tmp_path / "a.parquet").open("rb") as stream:
+        assert list(claims(stream, 2**24)) == expected
+        with pytest.raises(ValueError, match=r"index is damaged, or has over 100 bytes$"):
+            list(claims(stream, 100))
 
 
 @pytest.mark.slow

@@ -12,6 +12,10 @@ from typing import BinaryIO
 __all__ = ["check_boxes"]
 
 _CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts", b"moof", b"traf", b"mvex"}
+# What describes a film's samples holds boxes, too, behind so many bytes
+_DESCRIPTION = 8
+_VISUAL = 78
+_CODED = {b"avc1", b"avc3", b"hvc1", b"hev1", b"av01", b"vp09", b"mp4v", b"jpeg", b"mjpa", b"mjpb"}
 # Bytes an entry takes, behind 4 bytes of version and flags and 4 of the number of entries.
 _TABLES = {b"stts": 8, b"ctts": 8, b"stsc": 12, b"stco": 4, b"co64": 8, b"stss": 4, b"elst": 12}
 # stts and ctts say how many samples each entry stands for.
@@ -45,6 +49,10 @@ def check_boxes(file: BinaryIO) -> None:
         waiting.append((after, limit))
         if kind in _CONTAINERS:
             waiting.append((content, after))
+        elif kind == b"stsd":
+            waiting.append((content + _DESCRIPTION, after))
+        elif kind in _CODED:
+            waiting.append((content + _VISUAL, after))
         else:
             _check_table(file, kind, content, after)
     raise ValueError(f"the film has over {_MAX_BOXES} boxes")

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from regil_wrappers.formats.footer import claims
 from regil_wrappers.limits import Budget, need
 
 __all__ = ["batches", "json_file", "numbers"]
@@ -66,13 +67,11 @@ def batches(
         if not 0 <= index.num_rows <= _MAX_ROWS:
             raise ValueError(f"{path.name} claims {index.num_rows} rows, more than {_MAX_ROWS}")
         largest = 1
-        for group in range(index.num_row_groups):
-            for i in range(index.num_columns):
-                column = index.row_group(group).column(i)
-                if column.path_in_schema.split(".")[0] in wanted:
-                    size = max(column.total_uncompressed_size, 8 * column.num_values)
-                    budget.claim(f"{path.name}, column {column.path_in_schema!r},", size)
-                    largest = max(largest, size)
+        for column in claims(stream, _MAX_SCHEMA):
+            if column.path.split(".")[0] in wanted:
+                size = max(column.size, 8 * column.values)
+                budget.claim(f"{path.name}, column {column.path!r},", size)
+                largest = max(largest, size)
         at_once = max(1, min(1024, _BATCH_BYTES // largest))
         for batch in file.iter_batches(at_once, columns=wanted, use_threads=False):
             if batch.nbytes > 4 * _BATCH_BYTES:

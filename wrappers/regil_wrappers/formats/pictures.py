@@ -69,13 +69,25 @@ def decoded(file: BinaryIO | bytes) -> NDArray[np.uint8]:
         ValueError, OSError, SyntaxError: if it is neither, damaged, or claims too many pixels.
     """
     image = need("PIL.Image", "video", "reading pictures")
-    stream = io.BytesIO(file) if isinstance(file, bytes) else file
+    # From memory: Pillow reads as many bytes as a PNG's chunk claims, and a file on disk makes room
+    # for all of them first
+    stream = io.BytesIO(file if isinstance(file, bytes) else _content(file))
     # Pillow reads the header alone here.
     with no_bombs(image), image.open(stream, formats=("PNG", "JPEG")) as picture:
         check_pixels(*picture.size)
         if picture.mode not in ("RGB", "RGBA", "L", "P", "LA"):
             raise ValueError(f"a picture is of mode {picture.mode}: it must be 8-bit RGB or grey")
         return np.asarray(picture.convert("RGB"))
+
+
+def _content(file: BinaryIO) -> bytes:
+    size = file.seek(0, io.SEEK_END)
+    if size > 4 * MAX_PIXELS:
+        raise ValueError(
+            f"a picture of {size} bytes is none that is read: {4 * MAX_PIXELS} at most"
+        )
+    file.seek(0)
+    return file.read()
 
 
 @contextmanager

@@ -36,8 +36,8 @@ def read_mp4(
         frames: how many to read; None reads to the end.
 
     Raises:
-        ValueError: if there is no film in it, or its pictures are too large or too many; or an
-            error of PyAV (`OSError`, `ValueError`) if it is damaged.
+        ValueError: if there is no film in it, its pictures are too large or too many, or it is
+            damaged.
         ImportError: without PyAV.
     """
     av = need("av", "video", "reading mp4")
@@ -46,8 +46,11 @@ def read_mp4(
     # make FFmpeg open what it lists.
     with path.open("rb") as file:
         check_boxes(file)
-        with av.open(file, format="mp4") as container:
-            _decode(container, pictures, start, frames, times)
+        try:
+            with av.open(file, format="mp4") as container:
+                _decode(container, pictures, start, frames, times)
+        except av.error.FFmpegError as error:
+            raise ValueError(str(error)) from error
     if frames is not None and len(times) != frames:
         raise ValueError(f"the film has {len(times)} frames from {start:g} s on, not {frames}")
     return {"metadata": _timing(times)}
