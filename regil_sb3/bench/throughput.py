@@ -1,4 +1,4 @@
-"""Training steps a second beside SB3's own algorithms: `regil bench throughput`.
+"""Training steps a second beside SB3's own algorithms: first half of `regil bench throughput`.
 
 TD3BC with its BC term on, SB3's TD3 and SB3's SAC learn with the same encoder, heads, batch and
 updates a step, each on an environment of its own, all with the default preset's wrappers. They take
@@ -23,6 +23,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 from tqdm import tqdm
 
+from regil_sb3.bench import costs
 from regil_sb3.bench.timing import Timed
 from regil_sb3.policies import ConvEncoder
 from regil_sb3.recording import record_expert
@@ -168,9 +169,9 @@ def throughput(
     return rows
 
 
-def main(**options: Any) -> None:
-    """Measure the table and print it as markdown."""
-    rows = throughput(**options)
+def main(task: str = "button-press", **options: Any) -> None:
+    """Measure both tables, and print them as markdown."""
+    rows = throughput(task, **options)
     print("| algorithm | steps/s | ratio | environment | retrieval | update | rest (ms a step) |")
     print("|---|---|---|---|---|---|---|")
     for r in rows:
@@ -180,3 +181,5 @@ def main(**options: Any) -> None:
             + " | ".join(f"{part:.2f}" for part in parts)
             + " |"
         )
+    print()
+    costs.main(task)
