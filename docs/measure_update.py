@@ -10,6 +10,7 @@ import resource
 import subprocess
 import sys
 import time
+from shutil import which
 
 import gymnasium as gym
 import numpy as np
@@ -90,8 +91,9 @@ def convolutions():
         "channels last": ChannelsLast(SPACE),
         "space to depth": SpaceToDepth(SPACE),
         "bfloat16": ConvEncoder(SPACE, dtype="bfloat16"),
-        "torch.compile": th.compile(ConvEncoder(SPACE)),
     }
+    if which("c++"):
+        networks["torch.compile"] = th.compile(ConvEncoder(SPACE))
     forward = {n: lambda e=e: th.no_grad()(e)(batch.float() / 255) for n, e in networks.items()}
     both = {n: lambda e=e: e(batch.float() / 255).sum().backward() for n, e in networks.items()}
     forward, both = take_turns(forward), take_turns(both)

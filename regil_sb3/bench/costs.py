@@ -130,7 +130,7 @@ def costs(
     Args:
         task: of Meta-World.
         varied: of `VARIED`.
-        steps: of all environments together that are timed, after as many that are not.
+        steps: of all environments together that are timed, at least, after the warm-up.
     """
     varied = varied or {}
     n_envs, stack = varied.get("environments", 1), varied.get("stack", 2)
@@ -174,11 +174,14 @@ def costs(
             ):
                 clock.watch(owner, method, name)
             model.learn(steps)
+            while model.in_warmup:  # episodes that the guide has begun are its own to their end
+                model.learn(steps, reset_num_timesteps=False)
             clock.seconds.clear()
-            begun = time.perf_counter()
+            before, begun = model.num_timesteps, time.perf_counter()
             with clock.of("rest"):
                 model.learn(steps, log_interval=1, reset_num_timesteps=False)
             seconds = time.perf_counter() - begun
+            made = model.num_timesteps - before
             buffer = model.replay_buffer
             assert isinstance(buffer, FrameReplayBuffer)
             begun = time.perf_counter()
@@ -193,8 +196,8 @@ def costs(
             return Costs(
                 varied,
                 len(demo),
-                steps / seconds,
-                {part: 1e3 * clock.seconds[part] / steps for part in PARTS},
+                made / seconds,
+                {part: 1e3 * clock.seconds[part] / made for part in PARTS},
                 buffer.nbytes / (buffer.buffer_size * n_envs),
                 sum(array.nbytes for array in arrays) / 16,
                 saved,
@@ -204,7 +207,7 @@ def costs(
 def _learner(
     env: VecEnv, demo: str, own: Mapping[str, Any], varied: Mapping[str, int], steps: int
 ) -> TD3BC:
-    """With Q and the BC term on from half of the first steps on."""
+    """With Q and the BC term on from the end of a warm-up that is as short as can be."""
     settings = {
         **own,
         "warmup_steps": steps // 2,

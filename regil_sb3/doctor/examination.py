@@ -267,6 +267,7 @@ class _Episodes:
             if env.calibration() is not None:
                 return
             self._play(env, self._seeds[-1] + 1 + i, lambda _: env.guide_action())
+        env.reset(seed=self._seeds[-1])  # an episode that was cut short counts when the next begins
 
     def _guided(self, what: str, env: Any, watched: bool = False) -> list[Played]:
         played = []

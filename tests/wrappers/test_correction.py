@@ -230,6 +230,30 @@ def test_who_does_not_follow_teaches_it_nothing(demo: Demonstration, known: Any)
     assert successes(fresh, range(3)) == 3
 
 
+def test_an_episode_left_after_the_last_move_counts(demo: Demonstration) -> None:
+    env = guided(demo)
+    for seed in range(5):
+        env.reset(seed=seed)
+        over = False
+        while env._servo.kind == "calibration" and not over:
+            *_, terminated, truncated, _ = env.step(env.guide_action())
+            over = terminated or truncated
+    assert env.calibration() is not None
+    assert successes(env, range(3)) == 3
+    # the same for who has no wrapper
+    servo = guided(demo)._servo
+    servo.reset()
+    for _ in range(2000):
+        action = servo.action()
+        if action is None:
+            break
+        servo.executed(action, action, demo.frames[0])
+    assert not servo.calibrated
+    with pytest.warns(UserWarning, match="does not move the hand's picture"):
+        servo.reset()
+    assert servo.calibrated
+
+
 def test_calibration_round_trip(demo: Demonstration, known: dict[str, Any]) -> None:
     one, two = ready(demo, known), ready(demo, json.loads(json.dumps(known)))
     assert one.calibration() == two.calibration() == known

@@ -188,6 +188,7 @@ class Servo:
             kind: "corrected", "released" or "plain" in place of a choice between them.
             hand: (2,) px, how far the hand's picture is from where the demonstration's started.
         """
+        self.settle()
         self._begin_episode()
         if self._calibration is not None:
             self._moving = True

@@ -22,6 +22,7 @@ __all__ = ["batches", "json_file", "numbers"]
 
 _MAX_ROWS = 10_000_000
 _MAX_SCHEMA = 16 * 1024**2
+_MAX_INDEX = 64 * 1024**2
 # What one batch may unpack to: a value that a dictionary holds once can stand in every row.
 _BATCH_BYTES = 256 * 1024**2
 
@@ -67,10 +68,10 @@ def batches(
         if not 0 <= index.num_rows <= _MAX_ROWS:
             raise ValueError(f"{path.name} claims {index.num_rows} rows, more than {_MAX_ROWS}")
         largest = 1
-        for column in claims(stream, _MAX_SCHEMA):
-            if column.path.split(".")[0] in wanted:
+        for column in claims(stream, _MAX_INDEX):
+            if column.path[0] in wanted:
                 size = max(column.size, 8 * column.values)
-                budget.claim(f"{path.name}, column {column.path!r},", size)
+                budget.claim(f"{path.name}, column {column.path[0]!r},", size)
                 largest = max(largest, size)
         at_once = max(1, min(1024, _BATCH_BYTES // largest))
         for batch in file.iter_batches(at_once, columns=wanted, use_threads=False):
