@@ -320,7 +320,8 @@ class BAKU(SafeLoad, Offline):
         return loss.item()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "demo", "_seen", "_chunks"]
+        ours = ("demo", "_seen", "_chunks", "_last_obs", "_last_original_obs")
+        return [*super()._excluded_save_params(), *ours]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
