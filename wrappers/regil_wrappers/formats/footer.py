@@ -16,7 +16,7 @@ __all__ = ["Claim", "claims"]
 
 _DEEPEST = 16  # structures in structures; Parquet's own are 6
 _BINARY, _LIST, _SET, _MAP, _STRUCT = 8, 9, 10, 11, 12
-_INTEGERS = (4, 5, 6)
+_TRUTHS, _INTEGERS = (1, 2), (4, 5, 6)
 _WIDTHS = {1: 1, 2: 1, 3: 1, 7: 8}  # bytes of a truth, of a byte, of a double
 _ROW_GROUPS, _COLUMNS, _ABOUT = 4, 1, 3
 _PATH, _VALUES, _SIZE = 3, 5, 6
@@ -113,9 +113,9 @@ class _Compact:
             raise ValueError(_DAMAGED)
         return Claim(tuple(path), numbers[_VALUES], numbers[_SIZE])
 
-    def _skip_field(self, kind: int) -> None:
-        if kind not in (1, 2):
-            self._skip(kind, 1, 0)
+    def _skip_field(self, kind: int, depth: int = 0) -> None:
+        if kind not in _TRUTHS:
+            self._skip(kind, 1, depth)
 
     def _skip(self, kind: int, count: int, depth: int) -> None:
         """Go on behind so many values of a kind."""
@@ -131,8 +131,7 @@ class _Compact:
                 self._go(self._number())
             elif kind == _STRUCT:
                 for _, its in self.fields():
-                    if its not in (1, 2):
-                        self._skip(its, 1, depth + 1)
+                    self._skip_field(its, depth + 1)
             elif kind in (_LIST, _SET):
                 self._skip(*self._list(), depth + 1)
             elif kind == _MAP:
