@@ -290,7 +290,7 @@ def test_a_second_signal_ends_a_save_that_hangs(tmp_path, monkeypatch):
 
     def interrupt_twice():
         for _ in range(2):
-            hung.wait(20)
+            hung.wait(300)
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.2)
 

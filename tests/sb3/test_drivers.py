@@ -147,6 +147,7 @@ class FakeRobot:
         self.start()
 
     def start(self, port=0):
+        self.stopped = False
         self.server = serve(self.serve, "localhost", port)
         self.port = self.server.socket.getsockname()[1]
         self.address = f"ws://localhost:{self.port}"
@@ -154,6 +155,7 @@ class FakeRobot:
         self.thread.start()
 
     def stop(self):
+        self.stopped = True  # before websockets 15 a server that ends leaves its connections open
         self.server.shutdown()
         self.thread.join()
 
@@ -164,7 +166,7 @@ class FakeRobot:
 
     def serve(self, socket):
         topics = {}
-        while True:
+        while not self.stopped:
             try:
                 said = json.loads(socket.recv(0.02))
             except TimeoutError:

@@ -144,6 +144,7 @@ def test_stopped_and_resumed(tiny, monkeypatch):
     assert next(Path("video").glob("*.mp4")).stat().st_size > 0
 
 
+@pytest.mark.filterwarnings("ignore:Argument ``multivariate``")  # rl_zoo3's; Optuna 3 warns
 def test_two_workers_on_one_storage(tiny):
     common, _ = tiny
     search = ["-optimize", "--n-trials", "1", "--n-evaluations", "2", "--eval-episodes", "1",
