@@ -223,8 +223,8 @@ def main(table: str, **options: Any) -> list[Row]:
     Args:
         table: one of `TABLES`, "ranking" (`regil_sb3.bench.rewards`), "guide", "success-buffer" or
             "sensitivity" (modules of their names), "latency" (`regil_sb3.bench.latency`),
-            "memory" or "index" (`regil_sb3.bench.memory`), "throughput" (`regil_sb3.bench.throughput`), "faults"
-            (`regil_sb3.bench.faults`), or one of
+            "memory" or "index" (`regil_sb3.bench.memory`), "throughput"
+            (`regil_sb3.bench.throughput`), "faults" (`regil_sb3.bench.faults`), or one of
             `regil_sb3.bench.run_tables.LEARNING`.
         **options: the table's own.
 
