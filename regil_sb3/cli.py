@@ -146,32 +146,43 @@ def _parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="measure, as ratios in one run")
     bench.add_argument(
         "table",
-        help="rendering, retrieval, ranking, guide, success-buffer, latency, memory, index, "
-        "throughput, faults; baselines, ablations, rewards (training runs)",
+        help="rendering, retrieval, ranking, guide, success-buffer, sensitivity, latency, "
+        "memory, index, throughput, faults; baselines, ablations, rewards (training runs)",
     )
     bench.add_argument(
         "--tasks",
         nargs="+",
         metavar="TASK",
-        help="guide, success-buffer: Meta-World's (the paper's 7)",
+        help="guide, success-buffer, sensitivity: Meta-World's (the paper's 7)",
     )
-    bench.add_argument("--seeds", nargs="+", type=int, help="of demonstrations and runs (0 1; 0)")
-    bench.add_argument("--episodes", type=int, help="goals of each (20; 40)")
+    bench.add_argument(
+        "--seeds", nargs="+", type=int, help="of demonstrations and runs (0 1; success-buffer: 0)"
+    )
+    bench.add_argument(
+        "--episodes",
+        type=int,
+        help="goals: of each (20; 40); sensitivity: of a cell, all tasks together (50)",
+    )
     bench.add_argument("--disturbances", nargs="+", metavar="NAME", help="guide: (none)")
     bench.add_argument("--steps", type=int, help="agent steps (5000; 15000)")
-    bench.add_argument("--encoders", nargs="+", metavar="NAME", help="latency: (those at hand)")
+    bench.add_argument(
+        "--encoders",
+        nargs="+",
+        metavar="NAME",
+        help="latency: (those at hand); sensitivity: (the paper's, and two more)",
+    )
     bench.add_argument(
         "--frames", nargs="+", type=int, help="latency, memory, index: sizes of memory"
     )
     bench.add_argument("--dims", type=int, help="memory, index: of the embeddings (384)")
     bench.add_argument("--plot", metavar="FILE", help="memory: draw it")
     bench.add_argument("--methods", nargs="+", metavar="NAME", help="training runs: of these alone")
-    bench.add_argument("--out", help="training runs, faults: where they are kept (bench; faults)")
+    bench.add_argument("--out", help="where runs and cells are kept (bench; faults: faults)")
     bench.add_argument(
         "--dry-run",
         action="store_true",
         default=None,
-        help="training runs: say which, and for how long",
+        help="training runs and kept cells: say which, and for how long",
     )
     bench.add_argument("--workers", type=int, help="training runs: so many at a time (1)")
     for part in ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers"):

@@ -1,7 +1,9 @@
 """`regil bench TABLE`: this project measured, beside others.
 
 * ``tables`` - the command: which tables there are, and what each compares
-* ``guide``, ``rewards``, ``latency``, ``memory``, ``throughput`` - measured at once
+* ``guide``, ``sensitivity``, ``success_buffer`` - guided replay; ``replay`` is what they share
+* ``cells`` - what is kept and never measured twice; ``page`` - how tables are written
+* ``rewards``, ``latency``, ``memory``, ``throughput`` - measured at once
 * ``run_tables`` - tables made of many training runs, and ``runs``, which makes each run once
 * ``faults`` - kills, broken disks, hostile files: ``lives``, ``disk_faults``, ``hostile``
 * ``toy`` - a learner that lives for seconds

@@ -1,8 +1,8 @@
-"""`regil bench guide` and `regil bench success-buffer`: how often does the guide succeed?
+"""`regil bench guide`: how often does the guide succeed?
 
-Plain and corrected replay at the same unseen goals, undisturbed or with changed light, noise, a
-turned camera, a distractor or an undeclared mirror sign; and what each leaves in a success buffer.
-Nothing learns. The same arguments give the same tables on one machine, seconds apart.
+Plain replay, plain replay on pictures that are moved back, and corrected replay at the same unseen
+goals, undisturbed or with changed light, noise, a turned camera, a distractor or an undeclared
+mirror sign. Nothing learns. The same arguments give the same tables on one machine, seconds apart.
 """
 
 from __future__ import annotations
@@ -18,14 +18,20 @@ import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration, RetrievalGuideWrapper
 
-import regil_sb3  # registers the environments  # noqa: F401
+from regil_sb3.bench.replay import (
+    check,
+    demonstration,
+    env_id,
+    env_kwargs,
+    follow,
+    guides,
+    play,
+)
 from regil_sb3.bench.rewards import TASKS
 from regil_sb3.bench.timing import Timed
-from regil_sb3.envs import METAWORLD_TASKS
-from regil_sb3.recording import EVALUATION_SEEDS, record_expert
-from regil_sb3.settings import make_settings, presets
+from regil_sb3.envs import EVALUATION_SEEDS
 
-__all__ = ["DISTURBANCES", "Collected", "Guided", "guide", "main", "success_buffer", "table"]
+__all__ = ["DISTURBANCES", "Guided", "guide", "main", "table"]
 
 Frame = npt.NDArray[np.uint8]
 Change = Callable[[Frame, np.random.Generator], Frame]
@@ -94,6 +100,7 @@ class Guided:
         seed: the demonstration's.
         disturbance: of `DISTURBANCES`.
         plain: whether plain replay succeeded, goal by goal.
+        moved_back: whether it did on pictures that were moved back, at the same goals.
         corrected: whether corrected replay did, at the same goals.
         errors_cm: how far the believed place of the target is from the true one, in the table's
             plane, and that of where it is brought, where the task moves it too; only of episodes in
@@ -107,6 +114,7 @@ class Guided:
     seed: int
     disturbance: str
     plain: list[bool]
+    moved_back: list[bool]
     corrected: list[bool]
     errors_cm: list[float] = field(default_factory=list)
     seconds: float = 0.0
@@ -120,7 +128,7 @@ def guide(
     seeds: Sequence[int] = (0, 1),
     disturbances: Sequence[str] = ("none",),
 ) -> Iterator[Guided]:
-    """Replay plainly and corrected at the same goals; the correction calibrates first.
+    """Replay with each guide at the same goals; the correction calibrates first.
 
     Args:
         tasks: Meta-World's names, or ids of environments with a scripted expert.
@@ -133,28 +141,13 @@ def guide(
     """
     for task in tasks:
         for seed in seeds:
-            demo = record_expert(_env_id(task), seed, _env_kwargs(task))
+            demo = demonstration(task, seed)
             for disturbance in disturbances:
                 yield _guided(task, seed, demo, disturbance, episodes)
 
 
-def _arguments() -> dict[str, Any]:
-    """The guide of the default preset."""
-    entry = presets()["default"]["env_wrapper"][0]
-    return dict(entry["regil_wrappers.RetrievalGuideWrapper"])
-
-
-def _env_id(task: str) -> str:
-    return task if "/" in task else f"regil/metaworld-{task}-v0"
-
-
-def _env_kwargs(task: str) -> dict[str, Any]:
-    """As `regil train` makes it: LIBERO's time limits depend on the task."""
-    return make_settings(_env_id(task)).env_kwargs
-
-
 def _make(task: str, disturbance: str) -> gym.Env[Any, Any]:
-    env = gym.make(_env_id(task), **_env_kwargs(task))
+    env = gym.make(env_id(task), **env_kwargs(task))
     if disturbance == "camera":
         _turn_camera(env.unwrapped)
     elif disturbance in _CHANGES or disturbance == "distractor":
@@ -184,12 +177,15 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     home = _targets(reference)
     reference.close()
 
-    plain = RetrievalGuideWrapper(_make(task, disturbance), demo)
-    failed_or_not = [_play(plain, goal) for goal in goals]
-    plain.close()
+    known = guides()
+    replayed = []
+    for name in ("plain", "moved back"):
+        plain = RetrievalGuideWrapper(_make(task, disturbance), demo, **known[name])
+        replayed.append([play(plain, goal) for goal in goals])
+        plain.close()
 
     timed = Timed(_make(task, disturbance))
-    own = {**_arguments(), "disturbance": 0.0}
+    own = {**known["corrected"], "disturbance": 0.0}
     if disturbance == "mirror-auto":
         own["mirror"] = "auto"
     env = RetrievalGuideWrapper(timed, demo, **own)
@@ -197,7 +193,7 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     timed.seconds, start = 0.0, time.perf_counter()
     corrected, errors = [], []
     for goal in goals:
-        corrected.append(_play(env, goal))
+        corrected.append(play(env, goal))
         believed = [shift * env.unwrapped.metadata["regil"]["step_cm"] for shift in _believed(env)]
         for shift, moved in zip(believed, _targets(env) - home, strict=False):
             errors.append(float(np.linalg.norm((shift - 100 * moved)[:2])))
@@ -205,7 +201,16 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     said = (env.calibration() or {}).get("why", "")
     env.close()
     return Guided(
-        task, seed, disturbance, failed_or_not, corrected, errors, seconds / n, steps, said
+        task,
+        seed,
+        disturbance,
+        replayed[0],
+        replayed[1],
+        corrected,
+        errors,
+        seconds / n,
+        steps,
+        said,
     )
 
 
@@ -221,21 +226,6 @@ def _believed(env: RetrievalGuideWrapper[Any, Any]) -> list[npt.NDArray[np.float
     return [shift for shift in shifts if shift is not None]
 
 
-def _play(env: RetrievalGuideWrapper[Any, Any], seed: int) -> bool:
-    env.reset(seed=seed)
-    return _follow(env)[0]
-
-
-def _follow(env: RetrievalGuideWrapper[Any, Any]) -> tuple[bool, int]:
-    """Follow the guide to the episode's end: whether it succeeded, and agent steps."""
-    steps, over, info = 0, False, {"is_success": False}
-    while not over:
-        *_, terminated, truncated, info = env.step(env.guide_action())
-        over = terminated or truncated
-        steps += 1
-    return bool(info["is_success"]), steps
-
-
 def _calibrate(env: RetrievalGuideWrapper[Any, Any], seed: int) -> int:
     """Agent steps of the episodes that calibration took."""
     steps = 0
@@ -243,95 +233,39 @@ def _calibrate(env: RetrievalGuideWrapper[Any, Any], seed: int) -> int:
         env.reset(seed=seed + episode)
         if env.calibration() is not None:
             break
-        steps += _follow(env)[1]
+        steps += follow(env)[1]
     return steps
-
-
-@dataclass(frozen=True)
-class Collected:
-    """What a guide leaves in a success buffer.
-
-    Attributes:
-        task: Meta-World's name, or the id of an environment.
-        seed: of demonstration and episodes.
-        steps: agent steps guided, calibration included.
-        plain: transitions of successful episodes, plain replay.
-        corrected: the same with correction.
-    """
-
-    task: str
-    seed: int
-    steps: int
-    plain: int
-    corrected: int
-
-
-def success_buffer(
-    tasks: Sequence[str] = TASKS, seeds: Sequence[int] = (0,), steps: int = 5_000
-) -> Iterator[Collected]:
-    """Count the transitions of whole successful episodes in a guided warm-up.
-
-    Episodes that hold calibration moves count as none, and the demonstration itself is left out.
-    The guide is the default preset's, pushed off its way now and then as in training.
-
-    Args:
-        tasks: Meta-World's names, or ids of environments with a scripted expert.
-        seeds: of demonstration and episodes.
-        steps: agent steps of the warm-up.
-    """
-    for task in tasks:
-        for seed in seeds:
-            demo = record_expert(_env_id(task), seed, _env_kwargs(task))
-            kept = [
-                _collect(RetrievalGuideWrapper(_make(task, "none"), demo, **own), seed, steps)
-                for own in ({}, _arguments())
-            ]
-            yield Collected(task, seed, steps, *kept)
-
-
-def _collect(env: RetrievalGuideWrapper[Any, Any], seed: int, steps: int) -> int:
-    kept = length = 0
-    env.reset(seed=seed)
-    for _ in range(steps):
-        *_, terminated, truncated, info = env.step(env.disturbed_action())
-        length += 1
-        if terminated or truncated:
-            if info["is_success"] and not info["retrieval"].get("calibrating", False):
-                kept += length
-            length = 0
-            env.reset()
-    env.close()
-    return kept
 
 
 def table(results: Sequence[Guided]) -> list[str]:
     """A table in Markdown: one line a result, and means over each disturbance."""
     lines = [
-        "| task | demonstration | disturbance | plain | corrected | error, median / 90 % (cm) | "
-        "guide, s an episode | calibration, steps |",
-        "|---|---|---|---|---|---|---|---|",
+        "| task | demonstration | disturbance | plain | moved back | corrected | "
+        "error, median / 90 % (cm) | guide, s an episode | calibration, steps |",
+        "|---|---|---|---|---|---|---|---|---|",
         *map(_line, results),
     ]
     for disturbance in dict.fromkeys(r.disturbance for r in results):
         own = [r for r in results if r.disturbance == disturbance]
-        rates = [np.mean([np.mean(x) for x in side]) for side in _sides(own)]
         errors = [e for r in own for e in r.errors_cm]
         lines.append(
-            f"| **mean** | {len(own)} | {disturbance} | {rates[0]:.2f} | {rates[1]:.2f} | "
+            f"| **mean** | {len(own)} | {disturbance} | {_rates(own)} | "
             f"{_spread(errors)} | {np.mean([r.seconds for r in own]):.2f} | |"
         )
     return lines + [f"{r.task}, {r.seed}, {r.disturbance}: {r.said}" for r in results if r.said]
 
 
-def _sides(results: Sequence[Guided]) -> tuple[list[list[bool]], list[list[bool]]]:
-    return [r.plain for r in results], [r.corrected for r in results]
+def _rates(results: Sequence[Guided]) -> str:
+    """Plain, moved back and corrected: means over results."""
+    sides = ("plain", "moved_back", "corrected")
+    means = [np.mean([np.mean(getattr(result, side)) for result in results]) for side in sides]
+    return " | ".join(f"{mean:.2f}" for mean in means)
 
 
 def _line(r: Guided) -> str:
     return (
-        f"| {r.task} | {r.seed} | {r.disturbance} | {np.mean(r.plain):.2f} | "
-        f"{np.mean(r.corrected):.2f} | {_spread(r.errors_cm)} | {r.seconds:.2f} | "
-        f"{r.calibration_steps} |"
+        f"| {r.task} | {r.seed} | {r.disturbance} | {_rates([r])} | {_spread(r.errors_cm)} | "
+        f"{r.seconds:.2f} | {r.calibration_steps} |"
     )
 
 
@@ -341,48 +275,31 @@ def _spread(errors: Sequence[float]) -> str:
     return f"{np.median(errors):.1f} / {np.percentile(errors, 90):.1f}"
 
 
-def main(name: str, **options: Any) -> None:
+def main(
+    tasks: Sequence[str] = TASKS,
+    episodes: int = 20,
+    seeds: Sequence[int] = (0, 1),
+    disturbances: Sequence[str] = ("none",),
+) -> None:
     """Measure and print, line by line.
 
     Args:
-        name: "guide" or "success-buffer".
-        **options: of `guide` or `success_buffer`.
+        tasks: as for `guide`.
+        episodes: likewise.
+        seeds: likewise.
+        disturbances: likewise.
 
     Raises:
-        ValueError: if an option is none of the table's, or names what does not exist.
+        ValueError: if an option cannot be measured.
     """
-    known = {
-        "guide": ("tasks", "episodes", "seeds", "disturbances"),
-        "success-buffer": ("tasks", "seeds", "steps"),
-    }[name]
-    for option in options:
-        if option not in known:
-            raise ValueError(f"--{option} is no option of the table {name!r}: {', '.join(known)}")
-    for value in options.get("tasks", ()):
-        if _env_id(value) not in gym.registry:
-            known_tasks = ", ".join(METAWORLD_TASKS)
-            raise ValueError(f"--tasks {value}: choose from {known_tasks}, or an environment's id")
-    for value in options.get("disturbances", ()):
-        if value not in DISTURBANCES:
-            raise ValueError(f"--disturbances {value}: choose from {', '.join(DISTURBANCES)}")
-    if "camera" in options.get("disturbances", ()) and any("/" in t for t in options["tasks"]):
+    check(tasks, seeds, episodes=episodes)
+    for name in disturbances:
+        if name not in DISTURBANCES:
+            raise ValueError(f"--disturbances {name}: choose from {', '.join(DISTURBANCES)}")
+    if "camera" in disturbances and any("/" in task for task in tasks):
         raise ValueError("--disturbances camera: only Meta-World's cameras can be turned")
-    for option in ("episodes", "steps"):
-        if options.get(option, 1) < 1:
-            raise ValueError(f"--{option} {options[option]}: at least 1 is needed")
-    if name == "guide":
-        results = []
-        for result in guide(**options):
-            results.append(result)
-            print(_line(result), flush=True)
-        print("\n" + "\n".join(table(results)))
-        return
-    print("| task | seed | steps | plain | corrected |\n|---|---|---|---|---|", flush=True)
-    collected = []
-    for row in success_buffer(**options):
-        collected.append(row)
-        print(
-            f"| {row.task} | {row.seed} | {row.steps} | {row.plain} | {row.corrected} |", flush=True
-        )
-    means = [np.mean([getattr(row, side) for row in collected]) for side in ("plain", "corrected")]
-    print(f"| **mean** | | | {means[0]:.0f} | {means[1]:.0f} |", flush=True)
+    results = []
+    for result in guide(tasks, episodes, seeds, disturbances):
+        results.append(result)
+        print(_line(result), flush=True)
+    print("\n" + "\n".join(table(results)))

@@ -10,14 +10,13 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from regil_sb3.bench.machine import describe
+from regil_sb3.bench.page import said, write
 from regil_sb3.bench.runs import Run, finish_all, predicted_hours, seconds_of
 from regil_sb3.intervals import Interval, iqm
 
@@ -26,13 +25,7 @@ __all__ = ["LEARNING", "main", "planned", "raw", "table"]
 LEVELS = (0.8, 0.95)
 
 
-def _tables() -> dict[str, Any]:
-    text = (resources.files("regil_sb3.zoo_configs") / "tables.yml").read_text(encoding="utf-8")
-    tables: dict[str, Any] = yaml.safe_load(text)
-    return tables
-
-
-LEARNING = tuple(name for name in _tables() if name != "paper")
+LEARNING = tuple(name for name, table in said().items() if "methods" in table)
 """Tables whose rows are training runs."""
 
 
@@ -59,25 +52,25 @@ def planned(
     Raises:
         ValueError: there is no such method.
     """
-    said = _tables()[name]
+    own = said()[name]
     for method in methods or ():
-        if method not in said["methods"]:
-            raise ValueError(f"--methods {method}: choose from {', '.join(said['methods'])}")
+        if method not in own["methods"]:
+            raise ValueError(f"--methods {method}: choose from {', '.join(own['methods'])}")
     return [
         Run(
             root=str(root),
             env=f"regil/metaworld-{task}-v0",
             method=method,
             seed=seed,
-            steps=steps or said["steps"],
-            episodes=episodes or said["episodes"],
+            steps=steps or own["steps"],
+            episodes=episodes or own["episodes"],
             preset=asked.get("preset", ""),
             settings=tuple(asked.get("settings", ())),
             demo=str(Path(root) / "demos" / f"{task}-{seed}.hdf5"),
         )
-        for task in tasks or said["tasks"]
-        for seed in seeds or said["seeds"]
-        for method, asked in said["methods"].items()
+        for task in tasks or own["tasks"]
+        for seed in seeds or own["seeds"]
+        for method, asked in own["methods"].items()
         if not methods or method in methods
     ]
 
@@ -124,7 +117,7 @@ def table(runs: Sequence[Run]) -> list[str]:
     rows = list(raw(runs))
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    paper = _tables()["paper"]
+    paper = said()["paper"]["success"]
     lines = [
         f"| method | {' | '.join(tasks)} | IQM (95 %) | runs | steps to .8 | steps to .95 | "
         "minutes |",
@@ -213,40 +206,8 @@ def main(
         lines = table(runs)
         below = describe(("gymnasium", "metaworld", "mujoco", "stable-baselines3", "torch"))
         folder = Path(out)
-        command = f"    regil bench {name}{_words(options)}"
-        text = "\n".join([command, "", *lines, "", below, ""])
-        (folder / f"{name}.md").write_text(text, encoding="utf-8")
-        (folder / f"{name}.tex").write_text(_latex(lines), encoding="utf-8")
+        write(folder, name, options, lines, below)
         parquet.write_table(pa.Table.from_pylist(rows), folder / f"{name}.parquet")
         print("\n".join(lines))
     if failed:
         raise ValueError(f"{len(failed)} runs failed: {'; '.join(failed)}")
-
-
-def _words(options: dict[str, Any]) -> str:
-    words = ""
-    for option, value in options.items():
-        values = value if isinstance(value, list | tuple) else [value]
-        words += f" --{option} {' '.join(map(str, values))}"
-    return words
-
-
-def _latex(lines: list[str]) -> str:
-    """The same table in LaTeX (booktabs)."""
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    head, body = cells[0], cells[2:]
-    rows = [
-        " & ".join(row).replace("%", r"\%").replace("_", r"\_") + r" \\" for row in [head, *body]
-    ]
-    return "\n".join(
-        [
-            r"\begin{tabular}{l" + "c" * (len(head) - 1) + "}",
-            r"\toprule",
-            rows[0],
-            r"\midrule",
-            *rows[1:],
-            r"\bottomrule",
-            r"\end{tabular}",
-            "",
-        ]
-    )

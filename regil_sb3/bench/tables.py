@@ -9,8 +9,9 @@ from __future__ import annotations
 import inspect
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any
@@ -192,12 +193,14 @@ _ROOMS = (
     "ranking",
     "guide",
     "success-buffer",
+    "sensitivity",
     "latency",
     "memory",
     "index",
     "throughput",
     "faults",
 )
+_REPLAYED = ("guide", "success-buffer", "sensitivity")  # each has a module of its name
 FAULTS = ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers")
 """Parts of the table "faults", and the options that count them."""
 _OPTIONS = {
@@ -208,14 +211,20 @@ _OPTIONS = {
 }
 
 
+def _check_options(table: str, options: Iterable[str], known: Container[str]) -> None:
+    for name in options:
+        if name not in known:
+            raise ValueError(f"the table {table!r} has no option --{name.replace('_', '-')}")
+
+
 def main(table: str, **options: Any) -> list[Row]:
     """Measure a table and print it.
 
     Args:
-        table: one of `TABLES`, "ranking" (`regil_sb3.bench.rewards`), "guide" or "success-buffer"
-            (`regil_sb3.bench.guide`), "latency" (`regil_sb3.bench.latency`), "memory" or "index"
-            (`regil_sb3.bench.memory`), "throughput" (`regil_sb3.bench.throughput`), "faults"
-            (`regil_sb3.bench.faults`), or one of
+        table: one of `TABLES`, "ranking" (`regil_sb3.bench.rewards`), "guide", "success-buffer" or
+            "sensitivity" (modules of their names), "latency" (`regil_sb3.bench.latency`),
+            "memory" or "index" (`regil_sb3.bench.memory`), "throughput"
+            (`regil_sb3.bench.throughput`), "faults" (`regil_sb3.bench.faults`), or one of
             `regil_sb3.bench.run_tables.LEARNING`.
         **options: the table's own.
 
@@ -225,24 +234,20 @@ def main(table: str, **options: Any) -> list[Row]:
     Raises:
         ValueError: where there is no such table, or it has no such option.
     """
-    if table in ("guide", "success-buffer"):
-        from regil_sb3.bench import guide
-
-        guide.main(table, **options)
+    if table in _REPLAYED:
+        module = import_module(f"regil_sb3.bench.{table.replace('-', '_')}")
+        _check_options(table, options, inspect.signature(module.main).parameters)
+        module.main(**options)
         return []
     from regil_sb3.bench import run_tables
 
     if table in run_tables.LEARNING:
         known = set(inspect.signature(run_tables.planned).parameters)
         known |= set(inspect.signature(run_tables.main).parameters)
-        for name in options:
-            if name not in known - {"name", "root", "options"}:
-                raise ValueError(f"the table {table!r} has no option --{name}")
+        _check_options(table, options, known - {"name", "root", "options"})
         run_tables.main(table, **options)
         return []
-    for name in options:
-        if name not in _OPTIONS.get(table, ()):
-            raise ValueError(f"the table {table!r} has no option --{name}")
+    _check_options(table, options, _OPTIONS.get(table, ()))
     if table == "latency":
         from regil_sb3.bench import latency
 

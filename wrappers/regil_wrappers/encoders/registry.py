@@ -25,7 +25,7 @@ from regil_wrappers.encoders.timm_networks import (
     r3m,
 )
 from regil_wrappers.encoders.torchscript import torchscript
-from regil_wrappers.encoders.weights import local_weights
+from regil_wrappers.encoders.weights import MissingWeightsError, local_weights
 from regil_wrappers.encoders.whitening import Whitening
 
 __all__ = ["encoder_names", "encoders_at_hand", "make_encoder", "register_encoder", "runs_code"]
@@ -138,8 +138,8 @@ def make_encoder(name: str, **options: Hashable) -> Encoder:
             it: its factory's keywords.
 
     Raises:
-        ValueError: if there is no encoder of that name, it has no such option, or its weights
-            cannot be had.
+        ValueError: if there is no encoder of that name, or it has no such option.
+        MissingWeightsError: a ValueError, if its weights cannot be had.
         ImportError: if it needs a package that is not installed.
     """
     base, file, given = parse(name)
@@ -153,7 +153,8 @@ def make_encoder(name: str, **options: Hashable) -> Encoder:
         if whiten is None:
             return factory(**given)
     except (ImportError, ValueError) as error:
-        kind = ImportError if isinstance(error, ImportError) else ValueError
+        kinds = (ImportError, MissingWeightsError, ValueError)
+        kind = next(kind for kind in kinds if isinstance(error, kind))
         raise kind(f"encoder {name!r}: {error}") from error
     return Whitening(make_encoder(base + (f"@{file}" if file else ""), **given), whiten)
 

@@ -22,6 +22,7 @@ from regil_wrappers.encoders.network import (
 from regil_wrappers.encoders.options import one_of
 from regil_wrappers.encoders.preprocessing import Preprocessing
 from regil_wrappers.encoders.weights import (
+    MissingWeightsError,
     find_weights,
     missing_weights,
     read_weights,
@@ -206,7 +207,7 @@ def r3m(
         path = Path.home() / ".r3m" / f"r3m_{model.removeprefix('resnet')}" / "model.pt"
         if not path.is_file():
             reason = f"neither in {weights_folder()} nor {path}"
-            raise ValueError(missing_weights(_R3M_SOURCES[model], f"{name}.pt", reason))
+            raise MissingWeightsError(missing_weights(_R3M_SOURCES[model], f"{name}.pt", reason))
     network = timm.create_model(model, pretrained=False, num_classes=0)
     weights = read_weights(path)
     inside = "module.convnet."

@@ -2,7 +2,7 @@
 
 * ``weights_folder`` - the user's folder: ``REGIL_ENCODERS``
 * ``find_weights``, ``local_weights``, ``timm_weights`` - the path of a
-  file, or one line that says what to put where
+  file, or one line that says what to put where: ``MissingWeightsError``
 * ``read_weights`` - the tensors of a checkpoint; never other objects
 """
 
@@ -16,10 +16,21 @@ from typing import Any
 from regil_wrappers.encoders.cache import cache_folder
 from regil_wrappers.encoders.network import import_torch
 
-__all__ = ["find_weights", "local_weights", "read_weights", "timm_weights", "weights_folder"]
+__all__ = [
+    "MissingWeightsError",
+    "find_weights",
+    "local_weights",
+    "read_weights",
+    "timm_weights",
+    "weights_folder",
+]
 
 # What a repository of timm's holds, unless timm says otherwise; older ones have the second alone.
 _HUB_NAMES = ("model.safetensors", "pytorch_model.bin")
+
+
+class MissingWeightsError(ValueError):
+    """A network's weights are neither here nor to be downloaded."""
 
 
 def weights_folder() -> Path:
@@ -74,7 +85,8 @@ def timm_weights(timm: Any, model: str, file: str | None) -> Path:
     The hub is asked once, and given five seconds: its own client tries for most of a minute.
 
     Raises:
-        ValueError: of one line, if they are neither here nor to be downloaded.
+        MissingWeightsError: of one line, if they are neither here nor to be downloaded.
+        ValueError: if timm has none.
     """
     found = local_weights(timm, model, file)
     if found is not None:
@@ -97,7 +109,7 @@ def timm_weights(timm: Any, model: str, file: str | None) -> Path:
     source = hub.hf_hub_url(repository, names[0])
     if len(names) > 1:
         source += f" (where there is none, {names[1]} beside it, for {full}.bin)"
-    raise ValueError(
+    raise MissingWeightsError(
         missing_weights(source, f"{full}.safetensors", f"no download: {type(failed).__name__}")
     ) from failed
 

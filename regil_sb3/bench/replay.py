@@ -1,0 +1,108 @@
+"""Guided replay, as tables measure it.
+
+* ``guides`` - arguments of each guide that exists
+* ``env_id``, ``env_kwargs``, ``check`` - environments by the names that tables take
+* ``demonstration``, ``play``, ``follow`` - an episode of the expert's, and of a guide
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import gymnasium as gym
+from regil_wrappers import Demonstration, RetrievalGuideWrapper
+from regil_wrappers.encoders import make_encoder
+
+import regil_sb3  # registers the environments  # noqa: F401
+from regil_sb3.envs import METAWORLD_TASKS
+from regil_sb3.recording import check_seeds, record_expert
+from regil_sb3.settings import make_settings, presets
+
+__all__ = [
+    "check",
+    "demonstration",
+    "env_id",
+    "env_kwargs",
+    "follow",
+    "guides",
+    "play",
+]
+
+
+def guides() -> dict[str, dict[str, Any]]:
+    """Arguments of `RetrievalGuideWrapper` by the guide's name in tables.
+
+    "plain" replays (preset ``plain``), "moved back" does on pictures that are moved back
+    (``register``), "corrected" is the default preset's.
+    """
+    plain, corrected = (
+        dict(presets()[name]["env_wrapper"][0]["regil_wrappers.RetrievalGuideWrapper"])
+        for name in ("plain", "default")
+    )
+    return {"plain": plain, "moved back": {**plain, "register": True}, "corrected": corrected}
+
+
+def env_id(task: str) -> str:
+    """Of one of Meta-World's tasks, or what is an id already."""
+    return task if "/" in task else f"regil/metaworld-{task}-v0"
+
+
+def env_kwargs(task: str) -> dict[str, Any]:
+    """As `regil train` makes it: LIBERO's time limits depend on the task."""
+    return make_settings(env_id(task)).env_kwargs
+
+
+def check(tasks: Sequence[str], seeds: Sequence[int], **counts: int) -> None:
+    """Refuse options of a table that cannot be measured.
+
+    Args:
+        tasks: of `env_id`.
+        seeds: of demonstrations.
+        **counts: by their options' names.
+
+    Raises:
+        ValueError: naming the option, its value, and what would be right.
+    """
+    for task in tasks:
+        if env_id(task) not in gym.registry:
+            known = ", ".join(METAWORLD_TASKS)
+            raise ValueError(f"--tasks {task}: choose from {known}, or an environment's id")
+    for seed in seeds:
+        check_seeds(seed)
+    for option, values in (("tasks", tasks), ("seeds", seeds)):
+        if len(set(values)) < len(values):
+            raise ValueError(f"--{option} {' '.join(map(str, values))}: name each once")
+    for option, count in counts.items():
+        if count < 1:
+            raise ValueError(f"--{option} {count}: at least 1 is needed")
+
+
+@lru_cache(maxsize=1)
+def demonstration(task: str, seed: int, encoder: str = "pixels") -> Demonstration:
+    """The scripted expert's, with larger pictures where the encoder wants them.
+
+    Args:
+        task: of `env_id`.
+        seed: the first that is tried.
+        encoder: name of the one that the guide has.
+    """
+    size = getattr(make_encoder(encoder), "frame_size", None)
+    return record_expert(env_id(task), seed, env_kwargs(task), size)
+
+
+def play(env: RetrievalGuideWrapper[Any, Any], seed: int) -> bool:
+    """Whether an episode that follows the guide succeeds."""
+    env.reset(seed=seed)
+    return follow(env)[0]
+
+
+def follow(env: RetrievalGuideWrapper[Any, Any]) -> tuple[bool, int]:
+    """Follow the guide to the episode's end: whether it succeeded, and agent steps."""
+    steps, over, info = 0, False, {"is_success": False}
+    while not over:
+        *_, terminated, truncated, info = env.step(env.guide_action())
+        over = terminated or truncated
+        steps += 1
+    return bool(info["is_success"]), steps

@@ -1,0 +1,169 @@
+"""Kept cells, and the tables made of them: `regil bench sensitivity` and `success-buffer`."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from regil_wrappers.encoders.weights import MissingWeightsError
+
+from regil_sb3.bench import cells, replay, sensitivity, success_buffer
+from regil_sb3.bench.cells import Cell, below, finish, predicted_hours
+from regil_sb3.cli import main
+from regil_sb3.intervals import wilson
+
+DEFAULT = {"encoder": "pixels", "k": 5, "horizon": 4}
+
+
+def cell(folder, seed, calls, expected=10.0):
+    def measure():
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        calls.append(seed)
+        return {"doubled": 2 * seed}
+
+    return Cell(folder, {"seed": seed}, measure, expected)
+
+
+def test_a_killed_bench_goes_on_and_nothing_is_measured_twice(tmp_path, capsys):
+    calls = []
+    planned = [cell(tmp_path / "cells", seed, calls) for seed in (3, 1, 3, 2)]
+    assert not finish(planned, dry_run=True)
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 4
+    assert said[-1] == "3 of 3 cells to measure: about 0.01 hours"
+    assert not calls
+    with pytest.raises(KeyboardInterrupt):
+        finish(planned)
+    assert calls == [3, 1]
+    assert [one.kept is not None for one in planned] == [True, True, True, False]
+    calls.clear()
+    assert finish(planned)
+    assert calls == [2]
+    assert [one.found["doubled"] for one in planned] == [6, 2, 6, 4]
+    assert finish(planned, dry_run=True)
+    assert "Demonstrations of seeds 1, 2, 3; 3 cells, " in below(planned)
+    assert "commit " in below(planned)
+
+
+def test_a_cell_is_what_decides_its_result(tmp_path, monkeypatch):
+    one = cell(tmp_path, 1, [])
+    assert one.path == cell(tmp_path, 1, [], expected=2.0).path
+    assert one.path != cell(tmp_path, 2, []).path
+    monkeypatch.setattr(cells, "version", lambda name: "9")
+    assert one.path == one.path
+    assert one.path != cell(tmp_path, 1, []).path
+
+
+def test_hours_are_told_by_what_is_kept(tmp_path):
+    planned = [cell(tmp_path, 1, []), cell(tmp_path, 2, [], expected=30.0)]
+    assert predicted_hours(planned) == pytest.approx(40 / 3600)
+    finish(planned[:1])
+    kept = {**planned[0].kept, "seconds": 25.0}
+    planned[0].path.write_text(json.dumps(kept))
+    assert predicted_hours(planned) == pytest.approx(75 / 3600)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", "{"])
+def test_a_spoilt_file_gets_one_line(tmp_path, text):
+    one = cell(tmp_path, 1, [])
+    one.path.write_text(text)
+    with pytest.raises(ValueError, match=r"^.*json holds no cell of a table: remove it, and it is"):
+        finish([one])
+
+
+@pytest.fixture
+def without_dinov3(monkeypatch):
+    make_encoder = sensitivity.make_encoder
+
+    def made(name):
+        if name == "dinov3":
+            raise MissingWeightsError("encoder 'dinov3': its weights are not here")
+        return make_encoder(name)
+
+    monkeypatch.setattr(sensitivity, "make_encoder", made)
+
+
+def test_sensitivity_varies_one_at_a_time(tmp_path, without_dinov3):
+    plan = sensitivity.planned(
+        str(tmp_path), ["hammer", "door-open"], (0, 1), 7, ["pixels", "pixels?size=14", "dinov3"]
+    )
+    assert [key for key in plan if key[0] == "horizon"] == [("horizon", h) for h in (9, 4, 2)]
+    assert plan["encoder", "dinov3"] == "encoder 'dinov3': its weights are not here"
+    paths = {key: [c.path for c in found] for key, found in plan.items() if key[1] != "dinov3"}
+    # the default stands in three lines, and is measured once
+    assert paths["horizon", 4] == paths["k", 5] == paths["encoder", "pixels"]
+    assert len({path for found in paths.values() for path in found}) == (2 + 3 + 1 + 1) * 4
+    asked = [one.asked for one in plan["k", 1]]
+    assert all(one["guide"] == {**DEFAULT, "k": 1} for one in asked)
+    goals = [(one["env"], one["seed"], [g - 1_000_000 for g in one["goals"]]) for one in asked]
+    assert goals == [
+        ("regil/metaworld-hammer-v0", 0, [0, 2]),
+        ("regil/metaworld-hammer-v0", 1, [1, 3]),
+        ("regil/metaworld-door-open-v0", 0, [0, 2]),
+        ("regil/metaworld-door-open-v0", 1, [1]),
+    ]
+
+
+def test_sensitivity_is_printed_beside_the_papers(tmp_path, monkeypatch, capsys, without_dinov3):
+    calls = []
+
+    def successes(task, seed, goals, guide):
+        calls.append(guide)
+        return {"successes": [goal % 10 < guide["horizon"] for goal in goals]}
+
+    monkeypatch.setattr(sensitivity, "successes", successes)
+    command = ["bench", "sensitivity", "--tasks", "hammer", "--seeds", "0", "1", "--episodes", "10"]
+    command += ["--encoders", "pixels", "dinov3", "--out", str(tmp_path)]
+    assert main([*command, "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "12 of 12 cells to measure" in said
+    assert "encoder dinov3: encoder 'dinov3': its weights are not here" in said
+    assert not list(tmp_path.iterdir())
+    for _ in range(2):
+        assert main(command) == 0
+    assert len(calls) == 12
+    lines = capsys.readouterr().out.splitlines()
+    low, high = (bound / 100 for bound in wilson(9, 10))
+    assert f"| horizon | 9 | 0.90 ({low:.2f} to {high:.2f}) | 10 | 0.48 |" in lines
+    assert "| k | 5 (default) | 0.40 (0.17 to 0.69) | 10 | 0.53 |" in lines
+    assert "| encoder | pixels (default) | 0.40 (0.17 to 0.69) | 10 | - |" in lines
+    assert "| encoder | dinov3 | encoder 'dinov3': its weights are not here | - | 0.53 |" in lines
+    assert "varied about horizon 4, k 5, encoder pixels; 10 unseen goals a line" in lines[-1]
+    written = (tmp_path / "sensitivity.md").read_text()
+    assert written.startswith(f"    regil {' '.join(command[:-2])}\n")
+    assert lines[-1] in written
+
+
+def test_success_buffers_have_a_deviation_over_seeds(tmp_path, monkeypatch, capsys):
+    def collected(task, seed, steps, guide):
+        kept = steps * (seed + 1) * (1 + guide.get("register", False) + ("correction" in guide))
+        return {"transitions": kept}
+
+    monkeypatch.setattr(success_buffer, "collected", collected)
+    command = ["bench", "success-buffer", "--tasks", "hammer", "assembly", "--steps", "10"]
+    command += ["--out", str(tmp_path)]
+    assert main([*command, "--seeds", "0"]) == 0
+    assert "| hammer | 10 | 20 | 30 | 456 ± 147 |" in capsys.readouterr().out
+    assert main([*command, "--seeds", "0", "1", "2", "--dry-run"]) == 0
+    assert "12 of 18 cells to measure" in capsys.readouterr().out
+    assert main([*command, "--seeds", "0", "1", "2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "| task | plain | moved back | corrected | paper |"
+    assert "| hammer | 20 ± 10 | 40 ± 20 | 60 ± 30 | 456 ± 147 |" in lines
+    assert "| assembly | 20 ± 10 | 40 ± 20 | 60 ± 30 | - |" in lines
+    assert "| **mean** | 20 | 40 | 60 | - |" in lines
+
+
+def test_a_guide_that_is_followed():
+    guides = replay.guides()
+    assert guides["plain"] == DEFAULT
+    found = sensitivity.successes("button-press", 0, [1_000_000, 1_000_001], guides["plain"])
+    assert found == {"successes": [False, True]}
+    plain, corrected = (
+        success_buffer.collected("button-press", 0, 165, guides[name])
+        for name in ("plain", "corrected")
+    )
+    # the first 125 steps calibrate, and the last episode may be open
+    assert plain["transitions"] < corrected["transitions"] <= 40
+    assert corrected["successes"] < corrected["episodes"]
