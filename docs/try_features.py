@@ -23,7 +23,8 @@ from regil_wrappers.pinhole import Pinhole, nearest_to_path, solve_displacement
 from regil_wrappers.registration import Displacement, register
 
 from regil_sb3.bench import guide
-from regil_sb3.recording import EVALUATION_SEEDS, record_expert
+from regil_sb3.bench.replay import demonstration, guides, play
+from regil_sb3.envs import EVALUATION_SEEDS
 
 LARGER, STAGE = 4, 2  # times as large a picture; the network's stage, at a stride of 8 of that
 TRUNCATION, EXPLAINED = 1.5, 0.9  # a feature vector's own length is 1 in the mean
@@ -163,12 +164,12 @@ def replayed(task, demo, way, episodes):
     reference.reset(seed=int(demo.metadata["seed"]))
     home = guide._targets(reference)[0]
     episode.register = way  # what the wrapper's episodes register with
-    own = {**guide._arguments(), "disturbance": 0.0}
+    own = {**guides()["corrected"], "disturbance": 0.0}
     env = RetrievalGuideWrapper(guide._make(task, "none"), demo, **own)
     guide._calibrate(env, int(demo.metadata["seed"]) + 1)
     won, off = [], []
     for goal in range(EVALUATION_SEEDS, EVALUATION_SEEDS + episodes):
-        won.append(guide._play(env, goal))
+        won.append(play(env, goal))
         if isinstance(way, Voted):
             way.tell(won[-1])
         off.append(np.linalg.norm((solved(env) - 100 * (guide._targets(env)[0] - home))[:2]))
@@ -197,7 +198,7 @@ def main(tasks, episodes):
     print(f"|---|---|{'---|' * len(heads)}", flush=True)
     rows = []
     for task, seed in product(tasks, (0, 1)):
-        demo = record_expert(guide._env_id(task), seed, guide._env_kwargs(task))
+        demo = demonstration(task, seed)
         ways = register, features, Voted([register, features])
         won, off = zip(*(replayed(task, demo, way, episodes) for way in ways), strict=True)
         rows.append([f(e) for e in off[:2] for f in (np.median, ninety)] + [*map(np.mean, won)])

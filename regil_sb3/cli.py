@@ -147,7 +147,8 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument(
         "table",
         help="rendering, retrieval, ranking, guide, success-buffer, sensitivity, latency, "
-        "memory, index, throughput, faults; baselines, ablations, rewards (training runs)",
+        "memory, index, throughput, faults; baselines, ablations, rewards (training runs); "
+        "results (a page of all that is kept)",
     )
     bench.add_argument(
         "--tasks",
@@ -176,6 +177,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     bench.add_argument("--dims", type=int, help="memory, index: of the embeddings (384)")
     bench.add_argument("--plot", metavar="FILE", help="memory: draw it")
+    bench.add_argument("--page", metavar="FILE", help="results: (docs/results.md)")
     bench.add_argument("--methods", nargs="+", metavar="NAME", help="training runs: of these alone")
     bench.add_argument("--out", help="where runs and cells are kept (bench; faults: faults)")
     bench.add_argument(

@@ -2,7 +2,8 @@
 
 * ``tables`` - the command: which tables there are, and what each compares
 * ``guide``, ``sensitivity``, ``success_buffer`` - guided replay; ``replay`` is what they share
-* ``cells`` - what is kept and never measured twice; ``page`` - how tables are written
+* ``cells`` - what is kept and never measured twice; ``page`` - how tables are written;
+  ``results`` - all that are kept, on one page
 * ``rewards``, ``latency``, ``memory``, ``throughput`` - measured at once
 * ``run_tables`` - tables made of many training runs, and ``runs``, which makes each run once
 * ``faults`` - kills, broken disks, hostile files: ``lives``, ``disk_faults``, ``hostile``

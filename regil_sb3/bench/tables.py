@@ -194,13 +194,14 @@ _ROOMS = (
     "guide",
     "success-buffer",
     "sensitivity",
+    "results",
     "latency",
     "memory",
     "index",
     "throughput",
     "faults",
 )
-_REPLAYED = ("guide", "success-buffer", "sensitivity")  # each has a module of its name
+_MODULES = ("guide", "success-buffer", "sensitivity", "results")  # each has one of its name
 FAULTS = ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers")
 """Parts of the table "faults", and the options that count them."""
 _OPTIONS = {
@@ -221,11 +222,10 @@ def main(table: str, **options: Any) -> list[Row]:
     """Measure a table and print it.
 
     Args:
-        table: one of `TABLES`, "ranking" (`regil_sb3.bench.rewards`), "guide", "success-buffer" or
-            "sensitivity" (modules of their names), "latency" (`regil_sb3.bench.latency`),
-            "memory" or "index" (`regil_sb3.bench.memory`), "throughput"
-            (`regil_sb3.bench.throughput`), "faults" (`regil_sb3.bench.faults`), or one of
-            `regil_sb3.bench.run_tables.LEARNING`.
+        table: one of `TABLES`; "guide", "success-buffer", "sensitivity" or "results" (modules of
+            their names); "ranking" (`regil_sb3.bench.rewards`); "memory" or "index"
+            (`regil_sb3.bench.memory`); "latency", "throughput" or "faults" (modules of their
+            names); or one of `regil_sb3.bench.run_tables.LEARNING`.
         **options: the table's own.
 
     Returns:
@@ -234,7 +234,7 @@ def main(table: str, **options: Any) -> list[Row]:
     Raises:
         ValueError: where there is no such table, or it has no such option.
     """
-    if table in _REPLAYED:
+    if table in _MODULES:
         module = import_module(f"regil_sb3.bench.{table.replace('-', '_')}")
         _check_options(table, options, inspect.signature(module.main).parameters)
         module.main(**options)

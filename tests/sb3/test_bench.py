@@ -24,7 +24,7 @@ def test_unknown_table_gets_one_line():
     with pytest.raises(
         ValueError,
         match=r"^table 'speed' is not one of rendering, retrieval, ranking, guide, success-buffer, "
-        r"sensitivity, latency, memory, index, throughput, faults$",
+        r"sensitivity, results, latency, memory, index, throughput, faults$",
     ):
         tables.main("speed")
     with pytest.raises(ValueError, match=r"^the table 'retrieval' has no option --steps$"):
