@@ -142,7 +142,7 @@ def table(plan: Planned) -> list[str]:
     for (varied, value), cells in plan.items():
         shown = f"{value} (default)" if defaults[varied] == value else str(value)
         if isinstance(cells, str):
-            ours = f"{cells} | -"
+            ours = f"{cells.partition(' (')[0]} | -"  # the rest is for who wants to get it
         else:
             outcomes = [outcome for cell in cells for outcome in cell.found["successes"]]
             low, high = wilson(sum(outcomes), len(outcomes))

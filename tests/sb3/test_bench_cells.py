@@ -78,7 +78,7 @@ def without_dinov3(monkeypatch):
 
     def made(name):
         if name == "dinov3":
-            raise MissingWeightsError("encoder 'dinov3': its weights are not here")
+            raise MissingWeightsError("encoder 'dinov3': its weights are not here (a folder)")
         return make_encoder(name)
 
     monkeypatch.setattr(sensitivity, "make_encoder", made)
@@ -89,7 +89,7 @@ def test_sensitivity_varies_one_at_a_time(tmp_path, without_dinov3):
         str(tmp_path), ["hammer", "door-open"], (0, 1), 7, ["pixels", "pixels?size=14", "dinov3"]
     )
     assert [key for key in plan if key[0] == "horizon"] == [("horizon", h) for h in (9, 4, 2)]
-    assert plan["encoder", "dinov3"] == "encoder 'dinov3': its weights are not here"
+    assert plan["encoder", "dinov3"] == "encoder 'dinov3': its weights are not here (a folder)"
     paths = {key: [c.path for c in found] for key, found in plan.items() if key[1] != "dinov3"}
     # the default stands in three lines, and is measured once
     assert paths["horizon", 4] == paths["k", 5] == paths["encoder", "pixels"]
