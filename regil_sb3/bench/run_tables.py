@@ -199,7 +199,12 @@ def main(
     rows = list(raw(runs))
     if rows:
         lines = table(runs)
-        below = describe(("gymnasium", "metaworld", "mujoco", "stable-baselines3", "torch"))
+        seeds = ", ".join(map(str, sorted({row["seed"] for row in rows})))
+        hours = sum(seconds_of(run) or 0 for run in runs if run.finished) / 3600
+        below = (
+            f"Seeds {seeds}; {hours:.1f} hours, one run after the other; "
+            f"{describe(('gymnasium', 'metaworld', 'mujoco', 'stable-baselines3', 'torch'))}"
+        )
         folder = Path(out)
         write(folder, name, options, lines, below)
         write_rows(folder / f"{name}.parquet", rows)
