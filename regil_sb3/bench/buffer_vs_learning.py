@@ -167,6 +167,7 @@ def _draw(runs: Sequence[Learned], path: Path) -> None:
         axis.set_xlabel("transitions in the success buffer after the warm-up")
         axis.set_ylabel("success of the last policy")
         axis.set_ylim(-0.05, 1.05)
+        axis.set_xlim(left=0)
         axis.legend(fontsize=8)
 
 
