@@ -166,6 +166,12 @@ def _parser() -> argparse.ArgumentParser:
         help="goals: of each (20; 40); sensitivity: of a cell, all tasks together (50); "
         "trajectories: of the policy (10)",
     )
+    bench.add_argument(
+        "--each-task",
+        action="store_true",
+        default=None,
+        help="sensitivity: so many --episodes of each task",
+    )
     bench.add_argument("--disturbances", nargs="+", metavar="NAME", help="guide: (none)")
     bench.add_argument("--steps", type=int, help="agent steps (5000; 15000)")
     bench.add_argument(

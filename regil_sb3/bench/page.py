@@ -90,8 +90,9 @@ def figure(path: Path, rows: int = 1, columns: int = 1) -> Iterator[Any]:
 def _words(options: Mapping[str, Any]) -> str:
     words = ""
     for option, value in options.items():
+        words += f" --{option.replace('_', '-')}"
         values = value if isinstance(value, list | tuple) else [value]
-        words += f" --{option} {' '.join(map(str, values))}"
+        words += "".join(f" {one}" for one in values if one is not True)
     return words
 
 

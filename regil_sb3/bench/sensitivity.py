@@ -18,7 +18,7 @@ from regil_wrappers.encoders.weights import MissingWeightsError
 
 from regil_sb3.bench.cells import Cell, below, finish
 from regil_sb3.bench.page import said, write
-from regil_sb3.bench.replay import check, demonstration, env_id, env_kwargs, guides, play
+from regil_sb3.bench.replay import check, demonstration, env_id, env_kwargs, guides, play, task_of
 from regil_sb3.bench.rewards import TASKS
 from regil_sb3.envs import EVALUATION_SEEDS
 from regil_sb3.intervals import wilson
@@ -37,6 +37,7 @@ def planned(
     seeds: Sequence[int] = (0, 1),
     episodes: int = 50,
     encoders: Sequence[str] | None = None,
+    each_task: bool = False,
 ) -> Planned:
     """What is to be measured.
 
@@ -47,20 +48,22 @@ def planned(
         out: folder in which cells are kept.
         tasks: Meta-World's names, or ids of environments with a scripted expert.
         seeds: first seeds tried for the demonstrations; each gives one of each task.
-        episodes: of each cell of the table.
+        episodes: of each line of the table, all tasks together.
         encoders: names of encoders; None: those of ``zoo_configs/tables.yml``.
+        each_task: whether there are so many of each task instead.
 
     Raises:
         ValueError: an option cannot be measured.
     """
     check(tasks, seeds, episodes=episodes)
-    if episodes < len(tasks):
+    if episodes < len(tasks) and not each_task:
         raise ValueError(f"--episodes {episodes}: at least {len(tasks)}, one a task, are needed")
     plain = guides()["plain"]
     values: dict[str, Sequence[Any]] = dict(said()["sensitivity"])
     values["encoder"] = encoders or values["encoder"]
     keys, missing = _encoders({plain["encoder"], *values["encoder"]})
-    shares = [episodes // len(tasks) + (i < episodes % len(tasks)) for i in range(len(tasks))]
+    total = episodes * len(tasks) if each_task else episodes
+    shares = [total // len(tasks) + (i < total % len(tasks)) for i in range(len(tasks))]
     plan: Planned = {}
     for varied, choices in values.items():
         for value in choices:
@@ -135,22 +138,39 @@ def successes(
         env.close()
 
 
-def table(plan: Planned) -> list[str]:
-    """The table in Markdown: a line a value; its cells are kept, but for those that cannot be."""
+def table(plan: Planned, each_task: bool = False) -> list[str]:
+    """The table in Markdown: a line a value; its cells are kept, but for those that cannot be.
+
+    Args:
+        plan: of `planned`.
+        each_task: whether each task has a column of its own, too.
+    """
     defaults, paper = guides()["plain"], said()["paper"]["sensitivity"]
-    lines = ["| varied | value | success (95 %) | episodes | paper |", "|---|---|---|---|---|"]
+    measured = [cells for cells in plan.values() if not isinstance(cells, str)]
+    tasks = list(dict.fromkeys(task_of(c.asked["env"]) for cells in measured for c in cells))
+    columns = ["varied", "value", "success (95 %)", "episodes", "paper", *(tasks * each_task)]
+    lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
     for (varied, value), cells in plan.items():
         shown = f"{value} (default)" if defaults[varied] == value else str(value)
+        by_task: dict[str, list[bool]] = {task: [] for task in tasks}
         if isinstance(cells, str):
-            ours = f"{cells.partition(' (')[0]} | -"  # the rest is for who wants to get it
+            ours = [cells.partition(" (")[0], "-"]  # the rest is for who wants to get it
         else:
-            outcomes = [outcome for cell in cells for outcome in cell.found["successes"]]
-            low, high = wilson(sum(outcomes), len(outcomes))
-            rate = sum(outcomes) / len(outcomes)
-            ours = f"{rate:.2f} ({low / 100:.2f} to {high / 100:.2f}) | {len(outcomes)}"
-        theirs = paper[varied].get(value)
-        lines.append(f"| {varied} | {shown} | {ours} | {'-' if theirs is None else theirs} |")
+            for cell in cells:
+                by_task[task_of(cell.asked["env"])] += cell.found["successes"]
+            outcomes = [outcome for own in by_task.values() for outcome in own]
+            ours = [_rate(outcomes), str(len(outcomes))]
+        theirs = paper[varied].get(value, "-")
+        rates = [_rate(own) for own in by_task.values()] * each_task
+        lines.append(f"| {' | '.join([varied, shown, *ours, str(theirs), *rates])} |")
     return lines
+
+
+def _rate(outcomes: Sequence[bool]) -> str:
+    if not outcomes:
+        return "-"
+    low, high = (bound / 100 for bound in wilson(sum(outcomes), len(outcomes)))
+    return f"{sum(outcomes) / len(outcomes):.2f} ({low:.2f} to {high:.2f})"
 
 
 def main(
@@ -160,6 +180,7 @@ def main(
     seeds: Sequence[int] = (0, 1),
     episodes: int = 50,
     encoders: Sequence[str] | None = None,
+    each_task: bool = False,
 ) -> None:
     """Measure what is not kept, and print the table.
 
@@ -170,11 +191,12 @@ def main(
         seeds: likewise.
         episodes: likewise.
         encoders: likewise.
+        each_task: likewise.
 
     Raises:
         ValueError: an option cannot be measured.
     """
-    plan = planned(out, tasks, seeds, episodes, encoders)
+    plan = planned(out, tasks, seeds, episodes, encoders, each_task)
     cells = [cell for found in plan.values() if not isinstance(found, str) for cell in found]
     # what shares a demonstration is measured in a row
     cells.sort(key=lambda c: (c.asked["env"], c.asked["seed"], c.asked["guide"]["encoder"]))
@@ -185,13 +207,15 @@ def main(
                 print(f"{varied} {value}: {why}")
         return
     finish(cells)
-    lines = table(plan)
+    lines = table(plan, each_task)
     defaults = ", ".join(f"{name} {guides()['plain'][name]}" for name in said()["sensitivity"])
     spread = (
         f"Plain guided replay; one parameter varied about {defaults}; {episodes} unseen goals a "
-        f"line, spread evenly over {', '.join(tasks)}; Wilson's interval. {below(cells)}"
+        f"{'task and line' if each_task else 'line, spread evenly'} over {', '.join(tasks)}; "
+        f"Wilson's interval. {below(cells)}"
     )
     options: dict[str, Any] = {"tasks": tasks, "seeds": seeds, "episodes": episodes}
     options |= {"encoders": encoders} if encoders else {}
+    options |= {"each_task": True} if each_task else {}
     write(Path(out), "sensitivity", options, lines, spread)
     print("\n".join([*lines, "", spread]))

@@ -135,6 +135,29 @@ def test_sensitivity_is_printed_beside_the_papers(tmp_path, monkeypatch, capsys,
     assert lines[-1] in written
 
 
+def test_sensitivity_of_each_task(tmp_path, monkeypatch, capsys, without_dinov3):
+    def successes(task, seed, goals, guide):
+        return {"successes": [task == "hammer"] * len(goals)}
+
+    monkeypatch.setattr(sensitivity, "successes", successes)
+    command = ["bench", "sensitivity", "--tasks", "hammer", "door-open", "--episodes", "3"]
+    command += ["--encoders", "pixels", "dinov3"]
+    assert main([*command, "--each-task", "--out", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith("| episodes | paper | hammer | door-open |")
+    assert (
+        "| k | 1 | 0.50 (0.19 to 0.81) | 6 | 0.48 | 1.00 (0.44 to 1.00) | 0.00 (0.00 to 0.56) |"
+    ) in lines
+    assert (
+        "| encoder | dinov3 | encoder 'dinov3': its weights are not here | - | 0.53 | - | - |"
+        in (lines)
+    )
+    assert "3 unseen goals a task and line over hammer, door-open" in lines[-1]
+    assert " --each-task\n" in (tmp_path / "sensitivity.md").read_text()
+    assert main([*command, "--episodes", "1", "--each-task", "--dry-run"]) == 0
+    assert main([*command, "--episodes", "1"]) == 2
+
+
 def test_success_buffers_have_a_deviation_over_seeds(tmp_path, monkeypatch, capsys):
     def collected(task, seed, steps, guide):
         kept = steps * (seed + 1) * (1 + guide.get("register", False) + ("correction" in guide))
