@@ -2,9 +2,10 @@
 
 A run's demonstration, its guided warm-up and its last policy are played again, each path begins at
 one point, as in the paper's figure. A path is what the simulator says of the hand (an environment's
-``hand()``, (3,) m); where it says nothing, the sum of the translations that were executed. The
-success buffer itself holds no executed actions: of a guide that is pushed off its way it keeps what
-the guide wanted (DART). So its episodes are those of the warm-up, whose guide draws the same again.
+``hand_position()``, (3,) m); where it says nothing, the sum of the translations that were executed.
+The success buffer itself holds no executed actions: of a guide that is pushed off its way it keeps
+what the guide wanted (DART). So its episodes are those of the warm-up, whose guide draws the same
+again.
 """
 
 from __future__ import annotations
@@ -91,11 +92,11 @@ class _Hands:
     def __init__(self, env: VecEnv) -> None:
         facts: Mapping[str, Any] = env.get_attr("metadata")[0].get("regil", {})
         self.env = env
-        self.simulated = env.has_attr("hand")
+        self.simulated = env.has_attr("hand_position")
         if not self.simulated and "translation_dims" not in facts:
             raise ValueError(
-                "its environment says neither where the hand is (hand()) nor which parts of an "
-                'action move it (metadata["regil"]["translation_dims"])'
+                "its environment says neither where the hand is (hand_position()) nor which parts "
+                'of an action move it (metadata["regil"]["translation_dims"])'
             )
         self.dims = list(facts.get("translation_dims", ()))
         self.scale = 100.0 if self.simulated else float(facts.get("step_cm", 1.0))  # hands are in m
@@ -104,7 +105,7 @@ class _Hands:
 
     def before(self, actions: npt.NDArray[Any]) -> None:
         """Note where hands are; (n, A) are to be executed."""
-        now = self.env.env_method("hand") if self.simulated else actions[:, self.dims]
+        now = self.env.env_method("hand_position") if self.simulated else actions[:, self.dims]
         for track, place in zip(self._open, now, strict=True):
             track.append(np.array(place, float))
 

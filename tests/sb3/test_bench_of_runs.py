@@ -113,7 +113,7 @@ def test_the_warmup_is_the_runs_own(toy_run, monkeypatch):
         told(patch, translation_dims=[0, 1], step_cm=5.0)
         summed = played(run, 2)
     with monkeypatch.context() as patch:
-        patch.setattr(ToyReach, "hand", lambda self: self.point.copy(), raising=False)
+        patch.setattr(ToyReach, "hand_position", lambda self: self.point.copy(), raising=False)
         simulated = played(run, 2)
     assert (summed.simulated, simulated.simulated) == (False, True)
     for found in (summed, simulated):
@@ -184,7 +184,7 @@ def test_trajectories_from_the_command_line(toy_run, tmp_path, monkeypatch, caps
     words = ["bench", "trajectories", "--out", str(tmp_path), "--episodes", "1"]
     words += ["--runs", str(toy_run)]
     assert main(words) == 2
-    assert "says neither where the hand is (hand()) nor which" in capsys.readouterr().err
+    assert "says neither where the hand is (hand_position()) nor which" in capsys.readouterr().err
     told(monkeypatch, translation_dims=[0, 1])
     assert main(words) == 0
     said = capsys.readouterr().out
@@ -232,13 +232,13 @@ def test_metaworlds_hand():
 
     env = gym.make("regil/metaworld-button-press-v0", obs="state")
     with pytest.raises(ValueError, match="before reset"):
-        env.unwrapped.hand()
+        env.unwrapped.hand_position()
     state, _ = env.reset(seed=0)
-    before = env.unwrapped.hand()
+    before = env.unwrapped.hand_position()
     np.testing.assert_allclose(before, state[:3], atol=1e-6)
     for _ in range(5):
         env.step(np.array([0, 1, 0, 0], np.float32))
-    moved = 100 * (env.unwrapped.hand() - before)
+    moved = 100 * (env.unwrapped.hand_position() - before)
     assert 4 < moved[1] < 10  # 2 cm a step, and the hand lags behind
     assert np.abs(moved[[0, 2]]).max() < 1
     env.close()
