@@ -148,7 +148,8 @@ def _parser() -> argparse.ArgumentParser:
         "table",
         help="rendering, retrieval, ranking, guide, success-buffer, sensitivity, latency, "
         "memory, index, throughput, faults; baselines, ablations, rewards (training runs); "
-        "results (a page of all that is kept)",
+        "buffer-vs-learning, trajectories (of runs that have ended); results (a page of all that "
+        "is kept)",
     )
     bench.add_argument(
         "--tasks",
@@ -162,7 +163,8 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument(
         "--episodes",
         type=int,
-        help="goals: of each (20; 40); sensitivity: of a cell, all tasks together (50)",
+        help="goals: of each (20; 40); sensitivity: of a cell, all tasks together (50); "
+        "trajectories: of the policy (10)",
     )
     bench.add_argument("--disturbances", nargs="+", metavar="NAME", help="guide: (none)")
     bench.add_argument("--steps", type=int, help="agent steps (5000; 15000)")
@@ -179,6 +181,12 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--plot", metavar="FILE", help="memory: draw it")
     bench.add_argument("--page", metavar="FILE", help="results: (docs/results.md)")
     bench.add_argument("--methods", nargs="+", metavar="NAME", help="training runs: of these alone")
+    bench.add_argument(
+        "--runs",
+        nargs="+",
+        metavar="RUN",
+        help="trajectories, buffer-vs-learning: run folders (the latter: those in --out)",
+    )
     bench.add_argument("--out", help="where runs and cells are kept (bench; faults: faults)")
     bench.add_argument(
         "--dry-run",

@@ -105,6 +105,13 @@ class Settings:
                 f"{path.parent} is not a run folder of `regil train` ({path.name}: {error!r})"
             ) from error
 
+    @property
+    def warmup_steps(self) -> int:
+        """Agent steps in which the guide acts; 0 where there are none."""
+        known = inspect.signature(ALGOS[self.algo]).parameters
+        default = known["warmup_steps"].default if "warmup_steps" in known else 0
+        return int(self.hyperparams.get("warmup_steps", default))
+
     def retrieval(self, name: str) -> Any:
         """An argument that the retrieval wrappers share, such as ``encoder``."""
         for entry in self.env_wrapper:

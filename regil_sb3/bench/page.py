@@ -2,20 +2,24 @@
 
 * ``said`` - ``zoo_configs/tables.yml``
 * ``write`` - a table in Markdown and LaTeX: the command above, what it was measured on below
+* ``write_rows`` - what it was made from, as parquet
+* ``figure`` - a picture beside it
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import yaml
+from regil_wrappers.limits import need
 
 from regil_sb3.files import replacing
 
-__all__ = ["said", "write"]
+__all__ = ["figure", "need_parquet", "said", "write", "write_rows"]
 
 
 def said() -> dict[str, Any]:
@@ -38,12 +42,49 @@ def write(
         below: what stands below it.
     """
     command = f"    regil bench {name}{_words(options)}"
+    folder.mkdir(parents=True, exist_ok=True)
     for suffix, text in (
         ("md", "\n".join([command, "", *table, "", below, ""])),
         ("tex", _latex(table)),
     ):
         with replacing(folder / f"{name}.{suffix}") as file:
             file.write(text.encode())
+
+
+def need_parquet(table: str) -> None:
+    """Refuse to begin a table whose rows could not be written.
+
+    Raises:
+        ImportError: pyarrow is not installed.
+    """
+    need("pyarrow.parquet", "lerobot", f"regil bench {table}")
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows of equal keys as a parquet file."""
+    import pyarrow as pa  # type: ignore[import-untyped]
+    from pyarrow import parquet
+
+    with replacing(path) as file:
+        parquet.write_table(pa.Table.from_pylist(list(rows)), file)
+
+
+@contextmanager
+def figure(path: Path, rows: int = 1, columns: int = 1) -> Iterator[Any]:
+    """Panels to draw on, (rows, columns) of Matplotlib's axes, then saved as a PNG file."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    size = (4.6 * columns, 3.6 * rows)
+    drawn, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    try:
+        yield axes
+        with replacing(path) as file:
+            drawn.savefig(file, format="png", dpi=110)
+    finally:
+        plt.close(drawn)
 
 
 def _words(options: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """Guided replay, as tables measure it.
 
 * ``guides`` - arguments of each guide that exists
-* ``env_id``, ``env_kwargs``, ``check`` - environments by the names that tables take
+* ``env_id``, ``task_of``, ``env_kwargs``, ``check`` - environments by the names that tables take
 * ``demonstration``, ``play``, ``follow`` - an episode of the expert's, and of a guide
 """
 
@@ -28,6 +28,7 @@ __all__ = [
     "follow",
     "guides",
     "play",
+    "task_of",
 ]
 
 
@@ -47,6 +48,12 @@ def guides() -> dict[str, dict[str, Any]]:
 def env_id(task: str) -> str:
     """Of one of Meta-World's tasks, or what is an id already."""
     return task if "/" in task else f"regil/metaworld-{task}-v0"
+
+
+def task_of(env: str) -> str:
+    """The name that `env_id` makes the id of."""
+    task = env.removeprefix("regil/metaworld-").removesuffix("-v0")
+    return task if env_id(task) == env else env
 
 
 def env_kwargs(task: str) -> dict[str, Any]:

@@ -1,43 +1,117 @@
 """`regil bench results`: every table that is kept, on one page, and which are not there yet.
 
 Nothing is measured, and nothing is written by hand: a table's command stands above it, and what it
-was measured on below it, as the table itself was written.
+was measured on below it, as the table itself was written. Beside the page stands one of the same
+name in HTML, with the tables' pictures; of tables whose rows are training runs it draws success
+over steps and how probably a method beats the first, from the run folders.
 """
 
 from __future__ import annotations
 
+import base64
+import html
+from collections.abc import Sequence
 from pathlib import Path
 
+from regil_sb3.bench.replay import env_id
 from regil_sb3.bench.run_tables import LEARNING
+from regil_sb3.bench.runs import Run
 from regil_sb3.files import replacing
+from regil_sb3.report.comparison import NOTE, plots, scores
+from regil_sb3.report.page import card, write_page
+from regil_sb3.report.run_contents import RunContents, read_run
 
 __all__ = ["KEPT", "main"]
 
-KEPT = ("sensitivity", "success-buffer", *LEARNING)
-"""Tables that write ``NAME.md`` into their folder."""
+KEPT = {
+    "sensitivity": "",
+    "success-buffer": "",
+    **dict.fromkeys(LEARNING, ""),
+    "buffer-vs-learning": "",
+    "trajectories": " --runs RUN",
+}
+"""Tables that write ``NAME.md`` into their folder, and what their commands cannot do without."""
 
 
 def main(out: str = "bench", page: str = "docs/results.md") -> None:
-    """Write the page.
+    """Write both pages.
 
     Args:
         out: the tables' folder.
-        page: the Markdown file.
+        page: the Markdown file; the other one's name ends in ``.html``.
 
     Raises:
-        ValueError: there is no table in the folder, or no folder for the page.
+        ValueError: there is no table in the folder, one is damaged, or the page cannot be there.
     """
     found = {name: Path(out) / f"{name}.md" for name in KEPT}
     found = {name: path for name, path in found.items() if path.exists()}
     if not found:
-        raise ValueError(f"--out {out}: no table is there; make one: regil bench {KEPT[0]}")
-    if not Path(page).absolute().parent.is_dir():
-        raise ValueError(f"--page {page}: there is no folder {Path(page).parent}")
+        raise ValueError(
+            f"--out {out}: no table is there; make one: regil bench {next(iter(KEPT))}"
+        )
+    markdown = Path(page)
+    if not markdown.absolute().parent.is_dir():
+        raise ValueError(f"--page {page}: there is no folder {markdown.parent}")
+    if markdown.suffix != ".md":
+        raise ValueError(f"--page {page}: its name must end in .md")
+    texts = {name: path.read_text("utf-8").rstrip() for name, path in found.items()}
+    for name, text in texts.items():
+        if text.count("\n\n") != 2:
+            raise ValueError(f"{found[name]} is no table: remove it, and it is made again")
+    missing = [f"regil bench {name}{words}" for name, words in KEPT.items() if name not in found]
     parts = ["# Results", "Written by `regil bench results`, from tables that it keeps."]
-    parts += [f"## {name}\n\n{path.read_text('utf-8').rstrip()}" for name, path in found.items()]
-    missing = [f"* `regil bench {name}`" for name in KEPT if name not in found]
+    parts += [f"## {name}\n\n{text}" for name, text in texts.items()]
     if missing:
-        parts.append("\n".join(["## Not measured yet", "", *missing]))
-    with replacing(Path(page)) as file:
+        lines = [f"* `{command}`" for command in missing]
+        parts.append("\n".join(["## Not measured yet", "", *lines]))
+    cards, gone = [], [f"{command}: not measured yet" for command in missing]
+    for name, text in texts.items():
+        drawn, lacking = _learning(Path(out), name) if name in LEARNING else ("", [])
+        cards.append(card(name, _as_html(text) + _picture(Path(out) / f"{name}.png"), "wide"))
+        cards.append(drawn)
+        gone += lacking
+    with replacing(markdown) as file:
         file.write(("\n\n".join(parts) + "\n").encode())
+    write_page(markdown.with_suffix(".html"), "ReGIL: results", "", "".join(cards), NOTE, gone)
     print(f"{page}: {', '.join(found)}" + (f"; {len(missing)} not there yet" if missing else ""))
+
+
+def _learning(out: Path, name: str) -> tuple[str, list[str]]:
+    """Plots of a table's runs, and a line for each run that is not there any more."""
+    from pyarrow import parquet  # type: ignore[import-untyped]
+
+    keys = ["task", "method", "seed", "steps"]
+    table = parquet.read_table(out / f"{name}.parquet", columns=keys)
+    named: dict[str, list[RunContents]] = {}
+    gone = []
+    for task, method, seed, steps in dict.fromkeys(zip(*table.to_pydict().values(), strict=True)):
+        run = Run(str(out), env_id(task), method, seed, steps, demo="")
+        if run.finished:
+            named.setdefault(method, []).append(read_run(run.folder))
+        else:
+            gone.append(f"{run.folder}, a run of {name}, is not there any more")
+    return scores(named) + plots(named) if named else "", gone
+
+
+def _picture(path: Path) -> str:
+    if not path.exists():
+        return ""
+    code = base64.b64encode(path.read_bytes()).decode()
+    return f'<img alt="{html.escape(path.stem)}" src="data:image/png;base64,{code}">'
+
+
+def _as_html(text: str) -> str:
+    """A table as `regil_sb3.bench.page.write` writes it: command, table, and what stands below."""
+    command, table, below = text.split("\n\n")
+    head, _, *rows = (_cells(line) for line in table.splitlines())
+    lines = [f"<tr>{''.join(f'<th>{cell}</th>' for cell in head)}</tr>"]
+    lines += [f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows]
+    return (
+        f"<p><code>{html.escape(command.strip())}</code></p>"
+        f'<div class="scroll"><table class="figures">{"".join(lines)}</table></div>'
+        f'<p class="soft small">{html.escape(below)}</p>'
+    )
+
+
+def _cells(line: str) -> Sequence[str]:
+    return [html.escape(cell.strip().strip("*")) for cell in line.strip("|").split("|")]

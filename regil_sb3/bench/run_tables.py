@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from regil_sb3.bench.machine import describe
-from regil_sb3.bench.page import said, write
+from regil_sb3.bench.page import need_parquet, said, write, write_rows
+from regil_sb3.bench.replay import task_of
 from regil_sb3.bench.runs import Run, finish_all, predicted_hours, seconds_of
 from regil_sb3.intervals import Interval, iqm
 
@@ -83,7 +84,7 @@ def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
         policy = json.loads((run.folder / "evaluation.json").read_text())["policy"]
         for episode, success in enumerate(policy["successes"]):
             yield {
-                "task": _task(run),
+                "task": task_of(run.env),
                 "method": run.method,
                 "seed": run.seed,
                 "steps": run.steps,
@@ -93,10 +94,6 @@ def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
                 "minutes": (seconds_of(run) or np.nan) / 60,
                 **{f"steps to {level}": _steps_to(run, level) for level in LEVELS},
             }
-
-
-def _task(run: Run) -> str:
-    return run.env.removeprefix("regil/metaworld-").removesuffix("-v0")
 
 
 def _steps_to(run: Run, level: float) -> float:
@@ -197,17 +194,20 @@ def main(
             f"{predicted_hours(runs, workers):.1f} hours, {workers} at a time"
         )
         return
-    import pyarrow as pa  # type: ignore[import-untyped]
-    from pyarrow import parquet
-
+    need_parquet(name)
     failed = finish_all(runs, workers, ray)
     rows = list(raw(runs))
     if rows:
         lines = table(runs)
-        below = describe(("gymnasium", "metaworld", "mujoco", "stable-baselines3", "torch"))
+        seeds = ", ".join(map(str, sorted({row["seed"] for row in rows})))
+        hours = sum(seconds_of(run) or 0 for run in runs if run.finished) / 3600
+        below = (
+            f"Seeds {seeds}; {hours:.1f} hours, one run after the other; "
+            f"{describe(('gymnasium', 'metaworld', 'mujoco', 'stable-baselines3', 'torch'))}"
+        )
         folder = Path(out)
         write(folder, name, options, lines, below)
-        parquet.write_table(pa.Table.from_pylist(rows), folder / f"{name}.parquet")
+        write_rows(folder / f"{name}.parquet", rows)
         print("\n".join(lines))
     if failed:
         raise ValueError(f"{len(failed)} runs failed: {'; '.join(failed)}")

@@ -194,6 +194,8 @@ _ROOMS = (
     "guide",
     "success-buffer",
     "sensitivity",
+    "buffer-vs-learning",
+    "trajectories",
     "results",
     "latency",
     "memory",
@@ -201,7 +203,14 @@ _ROOMS = (
     "throughput",
     "faults",
 )
-_MODULES = ("guide", "success-buffer", "sensitivity", "results")  # each has one of its name
+_MODULES = (  # each has one of its name
+    "guide",
+    "success-buffer",
+    "sensitivity",
+    "buffer-vs-learning",
+    "trajectories",
+    "results",
+)
 FAULTS = ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers")
 """Parts of the table "faults", and the options that count them."""
 _OPTIONS = {
@@ -222,10 +231,11 @@ def main(table: str, **options: Any) -> list[Row]:
     """Measure a table and print it.
 
     Args:
-        table: one of `TABLES`; "guide", "success-buffer", "sensitivity" or "results" (modules of
-            their names); "ranking" (`regil_sb3.bench.rewards`); "memory" or "index"
-            (`regil_sb3.bench.memory`); "latency", "throughput" or "faults" (modules of their
-            names); or one of `regil_sb3.bench.run_tables.LEARNING`.
+        table: one of `TABLES`; "guide", "success-buffer", "sensitivity", "buffer-vs-learning",
+            "trajectories" or "results" (modules of their names); "ranking"
+            (`regil_sb3.bench.rewards`); "memory" or "index" (`regil_sb3.bench.memory`); "latency",
+            "throughput" or "faults" (modules of their names); or one of
+            `regil_sb3.bench.run_tables.LEARNING`.
         **options: the table's own.
 
     Returns:

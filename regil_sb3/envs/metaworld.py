@@ -276,6 +276,16 @@ class MetaWorldEnv(gym.Env[npt.NDArray[Any], npt.NDArray[np.float32]], EzPickle)
         """
         return None if self.render_mode is None else self.encoder_frame(self._render_size)
 
+    def hand(self) -> npt.NDArray[np.float64]:
+        """Where the hand is, (3,) m.
+
+        Raises:
+            ValueError: before the first `reset`.
+        """
+        if self._state is None:
+            raise ValueError("hand() was asked before reset(): call reset() first")
+        return np.array(self._state[:3])
+
     def targets(self) -> npt.NDArray[np.float64]:
         """Where what the task moves about stands, (1 or 2, 3) m."""
         return np.array(self._sim._last_rand_vec, float).reshape(-1, 3)

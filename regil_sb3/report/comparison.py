@@ -1,6 +1,7 @@
 """Several runs as one self-contained HTML page.
 
 * ``write_comparison`` - reads run folders and writes the page
+* ``scores``, ``plots`` - what is on it, of runs that have their methods' names
 * ``methods`` - which runs differ in their seed or task alone
 """
 
@@ -8,7 +9,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,24 @@ from regil_sb3.report.charts import Line, line_chart
 from regil_sb3.report.page import card, flat, write_page
 from regil_sb3.report.run_contents import RunContents, column, number, read_run, successes
 
-__all__ = ["methods", "write_comparison"]
+__all__ = ["NOTE", "methods", "plots", "scores", "write_comparison"]
 
 _COLOURS = 6  # as many as the page has for methods
 _NOT_COMPARED = ("env", "seed", "versions.")
 _NAMED = 2  # settings in a method's name
 
+NOTE = (
+    "Interquartile mean (IQM): the mean of the middle half of all runs' success rates; in "
+    "brackets its 95 % stratified bootstrap interval, runs drawn again within each task "
+    "(Agarwal et al. 2021; the statistic of rliable, computed with scipy.stats.bootstrap). It "
+    "says how much other seeds would change it. A run's own interval is Wilson's, of its "
+    "episodes."
+)
+"""What the figures are."""
+
 Runs = Sequence[RunContents]
+Named = Mapping[str, Runs]
+"""Runs by the name of their method."""
 
 
 def write_comparison(runs: Sequence[Path | str], out: Path | str) -> Path:
@@ -60,45 +72,51 @@ def write_comparison(runs: Sequence[Path | str], out: Path | str) -> Path:
     if not evaluated:
         raise ValueError("none of these runs has been evaluated: regil evaluate RUN")
     named = methods(evaluated)
+    differ = card("Where they differ", _differences(evaluated))
+    tasks = len({run.env for run in evaluated})
+    write_page(
+        out,
+        f"ReGIL: {len(evaluated)} runs, {tasks} {'task' if tasks == 1 else 'tasks'}",
+        scores(named),
+        plots(named, differ) + card("Runs", _runs(named), "wide"),
+        NOTE,
+        missing,
+    )
+    return out
+
+
+def plots(named: Named, beside: str = "") -> str:
+    """HTML: success over steps, how probably each is better than the first, success of each task.
+
+    Args:
+        named: evaluated runs, the first method's first.
+        beside: HTML to stand below the second of them.
+
+    Raises:
+        ValueError: there are more methods than colours.
+    """
     if len(named) > _COLOURS:
         raise ValueError(
             f"these are runs of {len(named)} methods ({'; '.join(named)}): compare at most "
             f"{_COLOURS} at once"
         )
-    tasks = sorted({run.env for run in evaluated})
-    by_task = "".join(_task_row(task, named) for task in tasks)
-    heads = "".join(f"<th>{html.escape(name)}</th>" for name in named)
     columns = (
         card("Success over steps", _curves(named)),
-        card("Is it better?", _improvements(named))
-        + card("Where they differ", _differences(evaluated)),
+        card("Is it better?", _improvements(named)) + beside,
     )
     grid = "".join(f'<div class="column">{column}</div>' for column in columns)
-    body = "".join(
-        [
-            f'<div class="grid">{grid}</div>',
-            card(
-                "Success of each task",
-                f'<div class="scroll"><table class="figures"><tr><th></th>{heads}</tr>{by_task}'
-                "</table></div>",
-                "wide",
-            ),
-            card("Runs", _runs(named), "wide"),
-        ]
+    heads = "".join(f"<th>{html.escape(name)}</th>" for name in named)
+    by_task = "".join(_task_row(task, named) for task in _tasks(named))
+    return f'<div class="grid">{grid}</div>' + card(
+        "Success of each task",
+        f'<div class="scroll"><table class="figures"><tr><th></th>{heads}</tr>{by_task}'
+        "</table></div>",
+        "wide",
     )
-    write_page(
-        out,
-        f"ReGIL: {len(evaluated)} runs, {len(tasks)} {'task' if len(tasks) == 1 else 'tasks'}",
-        _headline(named, tasks),
-        body,
-        "Interquartile mean (IQM): the mean of the middle half of all runs' success rates; in "
-        "brackets its 95 % stratified bootstrap interval, runs drawn again within each task "
-        "(Agarwal et al. 2021; the statistic of rliable, computed with scipy.stats.bootstrap). It "
-        "says how much other seeds would change it. A run's own interval is Wilson's, of its "
-        "episodes.",
-        missing,
-    )
-    return out
+
+
+def _tasks(named: Named) -> list[str]:
+    return sorted({run.env for runs in named.values() for run in runs})
 
 
 def methods(runs: Runs) -> dict[str, list[RunContents]]:
@@ -173,8 +191,9 @@ def _within(found: Interval) -> str:
     return f"({100 * found.low:.0f} to {100 * found.high:.0f} %)"
 
 
-def _headline(named: dict[str, list[RunContents]], tasks: Sequence[str]) -> str:
-    cards = []
+def scores(named: Named) -> str:
+    """HTML: a box for each method, with the interquartile mean of its runs' success."""
+    cards, tasks = [], _tasks(named)
     for i, (name, runs) in enumerate(named.items()):
         found = iqm(_scores(runs, tasks))
         n_tasks = len({run.env for run in runs})
@@ -191,7 +210,7 @@ def _headline(named: dict[str, list[RunContents]], tasks: Sequence[str]) -> str:
     )
 
 
-def _curves(named: dict[str, list[RunContents]]) -> str:
+def _curves(named: Named) -> str:
     """IQM of the policy's evaluations over steps, where every run of a method has one."""
     lines = []
     for i, (name, runs) in enumerate(named.items()):
@@ -221,7 +240,7 @@ def _curves(named: dict[str, list[RunContents]]) -> str:
     return chart + note if chart else ""
 
 
-def _improvements(named: dict[str, list[RunContents]]) -> str:
+def _improvements(named: Named) -> str:
     """Each method against the first."""
     (first, theirs), *others = named.items()
     rows = []
@@ -253,7 +272,7 @@ def _differences(runs: Runs) -> str:
     return f"<table>{''.join(rows)}</table>" if rows else ""
 
 
-def _task_row(task: str, named: dict[str, list[RunContents]]) -> str:
+def _task_row(task: str, named: Named) -> str:
     cells = []
     for runs in named.values():
         scores = [score for of_task in _scores(runs, [task]) for score in of_task]
@@ -267,7 +286,7 @@ def _task_row(task: str, named: dict[str, list[RunContents]]) -> str:
     return f"<tr><td>{html.escape(task)}</td>{''.join(cells)}</tr>"
 
 
-def _runs(named: dict[str, list[RunContents]]) -> str:
+def _runs(named: Named) -> str:
     rows = []
     for i, (name, runs) in enumerate(named.items()):
         for run in sorted(runs, key=lambda run: (run.env, str(run.config.get("seed")))):

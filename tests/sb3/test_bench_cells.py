@@ -167,20 +167,3 @@ def test_a_guide_that_is_followed():
     # the first 125 steps calibrate, and the last episode may be open
     assert plain["transitions"] < corrected["transitions"] <= 40
     assert corrected["successes"] < corrected["episodes"]
-
-
-def test_results_are_the_tables_that_are_kept(tmp_path, capsys):
-    bench, page = tmp_path / "bench", tmp_path / "results.md"
-    bench.mkdir()
-    words = ["bench", "results", "--out", str(bench), "--page", str(page)]
-    assert main(words) == 2
-    assert "no table is there; make one: regil bench sensitivity" in capsys.readouterr().err
-    (bench / "sensitivity.md").write_text(
-        "    regil bench sensitivity\n\n| H | 4 |\n\nOn a machine\n"
-    )
-    assert main(words) == 0
-    text = page.read_text()
-    assert "## sensitivity\n\n    regil bench sensitivity\n\n| H | 4 |\n\nOn a machine\n" in text
-    assert "* `regil bench success-buffer`\n* `regil bench ablations`" in text
-    assert main([*words[:-1], str(tmp_path / "none" / "results.md")]) == 2
-    assert "there is no folder" in capsys.readouterr().err

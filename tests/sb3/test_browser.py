@@ -10,6 +10,8 @@ from pathlib import Path
 import made_run
 import pytest
 
+from regil_sb3.bench import results
+from regil_sb3.bench.page import figure, write
 from regil_sb3.report.comparison import write_comparison
 from regil_sb3.report.run_page import write_report
 
@@ -39,9 +41,15 @@ def expect(browser):
 def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     runs = [made_run.run(folder / f"{i}", seed=i, solved=19 - i) for i in range(2)]
+    wide = ["| " + " | ".join(["a column"] * 12) + " |"] * 3
+    write(folder, "trajectories", {"runs": ["a/long/way/" * 20]}, wide, "b/long/way/" * 20)
+    with figure(folder / "trajectories.png", columns=2):
+        pass  # empty panels will do
+    results.main(str(folder), str(folder / "results.md"))
     return {
         "report": write_report(runs[0]),
         "comparison": write_comparison(runs, folder / "comparison.html"),
+        "results": folder / "results.html",
     }
 
 
@@ -61,7 +69,7 @@ def opened(browser, page: Path, scheme="light", width=1280):
 
 @pytest.mark.parametrize("width", WIDTHS.values(), ids=WIDTHS)
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("name", ["report", "comparison"])
+@pytest.mark.parametrize("name", ["report", "comparison", "results"])
 def test_a_page_of_any_width_in_any_theme(browser, pages, name, scheme, width):
     tab, said, asked = opened(browser, pages[name], scheme, width)
     assert [url for url in asked if not url.startswith(("file:", "data:"))] == []

@@ -114,6 +114,7 @@ def test_what_is_written(runs, failed, tmp_path, monkeypatch):
     assert {row["seed"] for row in rows} == {0, 1}
     text = (tmp_path / "ablations.md").read_text()
     assert "regil bench ablations" in text
+    assert "Seeds 0, 1; 0.0 hours, one run after the other; " in text
     assert "commit" in text
     assert np.mean([row["success"] for row in rows]) == pytest.approx(
         float(text.split("| ReGIL | ")[1].split(" ")[0]), abs=1e-3

@@ -1,0 +1,210 @@
+"""`regil bench buffer-vs-learning`: does a fuller success buffer make a better policy?
+
+Of finished runs alone: what the guide left in the success buffer when its warm-up ended, and how
+often the last policy succeeds in unseen episodes. Nothing learns, and nothing is played.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats  # type: ignore[import-untyped]
+
+from regil_sb3.bench.machine import describe
+from regil_sb3.bench.page import figure, need_parquet, write, write_rows
+from regil_sb3.bench.replay import task_of
+from regil_sb3.intervals import wilson
+from regil_sb3.report.run_contents import STEPS, RunContents, read_run, successes
+from regil_sb3.settings import Settings
+
+__all__ = ["Learned", "Rank", "buffer_after_warmup", "learned", "main", "rank", "table"]
+
+_FEWEST = 3  # runs, of which ranks say anything
+_RESAMPLES = 9_999
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A finished run.
+
+    Attributes:
+        run: its folder.
+        task: Meta-World's name, or the environment's id.
+        seed: of the run.
+        warmup: agent steps in which the guide acted.
+        buffer: transitions in the success buffer when they were over, the demonstration's left out.
+        successes: of the last policy.
+        episodes: unseen ones.
+    """
+
+    run: str
+    task: str
+    seed: int
+    warmup: int
+    buffer: int
+    successes: int
+    episodes: int
+
+    @property
+    def success(self) -> float:
+        """Rate."""
+        return self.successes / self.episodes
+
+
+class Rank(NamedTuple):
+    """Spearman's rank correlation; NaN where one side does not vary or runs are too few.
+
+    Attributes:
+        rho: in [-1, 1].
+        p: two-sided, of a permutation test (exact where there are few runs).
+        n: runs.
+    """
+
+    rho: float
+    p: float
+    n: int
+
+
+def buffer_after_warmup(run: RunContents, warmup: int) -> int | None:
+    """Transitions in the success buffer when the warm-up was over, without the demonstration's.
+
+    Args:
+        run: with its log and its demonstration.
+        warmup: agent steps of it; an episode begun in it is finished in it.
+
+    Returns:
+        the first that is logged once it is over; None where that is nowhere.
+    """
+    if run.demo is None or run.demo.actions is None:
+        return None
+    for row in run.rows:
+        # the policy is first evaluated as the warm-up ends; until then only the guide acts
+        over = row[STEPS] >= warmup and ("eval/success_rate" in row or not row.get("time/guided"))
+        if over and "success_buffer/steps" in row:
+            return int(row["success_buffer/steps"]) - len(run.demo.actions)
+    return None
+
+
+def learned(folders: Sequence[Path | str]) -> tuple[list[Learned], list[str]]:
+    """What runs say, and a line for each that says too little.
+
+    Args:
+        folders: of runs.
+
+    Raises:
+        ValueError: one is no run folder.
+    """
+    found, left_out = [], []
+    for folder in folders:
+        run = read_run(folder)
+        settings = Settings.load(run.folder / "config.yaml")
+        outcomes = successes(run.evaluation.get("policy"))
+        buffer = buffer_after_warmup(run, settings.warmup_steps)
+        if not settings.warmup_steps:
+            left_out.append(f"{folder}: no guide acted in it")
+        elif not outcomes:
+            left_out.append(f"{folder}: its policy is not evaluated (regil evaluate {folder})")
+        elif buffer is None:
+            left_out.append(f"{folder}: its log does not reach the end of the warm-up")
+        else:
+            found.append(
+                Learned(
+                    str(folder),
+                    task_of(settings.env),
+                    settings.seed,
+                    settings.warmup_steps,
+                    buffer,
+                    sum(outcomes),
+                    len(outcomes),
+                )
+            )
+    return found, left_out
+
+
+def rank(runs: Sequence[Learned]) -> Rank:
+    """Rank correlation of buffer and success."""
+    x, y = [run.buffer for run in runs], [run.success for run in runs]
+    if len(runs) < _FEWEST or len(set(x)) == 1 or len(set(y)) == 1:
+        return Rank(np.nan, np.nan, len(runs))
+    tested = stats.permutation_test(
+        (x,),
+        lambda x: stats.spearmanr(x, y).statistic,
+        permutation_type="pairings",
+        n_resamples=_RESAMPLES,
+        rng=np.random.default_rng(0),
+    )
+    return Rank(float(tested.statistic), float(tested.pvalue), len(runs))
+
+
+def table(runs: Sequence[Learned]) -> list[str]:
+    """The table in Markdown: a line a run, the fullest buffer first."""
+    lines = ["| task | seed | warm-up | buffer | success (95 %) | run |", "|" + "---|" * 6]
+    for run in sorted(runs, key=lambda run: -run.buffer):
+        low, high = (bound / 100 for bound in wilson(run.successes, run.episodes))
+        lines.append(
+            f"| {run.task} | {run.seed} | {run.warmup} | {run.buffer} | "
+            f"{run.success:.2f} ({low:.2f} to {high:.2f}) | {run.run} |"
+        )
+    return lines
+
+
+def _said(what: str, found: Rank) -> str:
+    if np.isnan(found.rho):
+        return f"{what}: none, of {found.n}"
+    return f"{what}: {found.rho:+.2f} (p {found.p:.3f}) of {found.n}"
+
+
+def _draw(runs: Sequence[Learned], path: Path) -> None:
+    with figure(path) as ((axis,),):
+        for i, task in enumerate(dict.fromkeys(run.task for run in runs)):
+            own = [run for run in runs if run.task == task]
+            points = [run.buffer for run in own], [run.success for run in own]
+            axis.plot(*points, "o", color=f"C{i}", label=task)
+        axis.set_xlabel("transitions in the success buffer after the warm-up")
+        axis.set_ylabel("success of the last policy")
+        axis.set_ylim(-0.05, 1.05)
+        axis.set_xlim(left=0)
+        axis.legend(fontsize=8)
+
+
+def main(runs: Sequence[str] = (), out: str = "bench") -> None:
+    """Read runs, and print the table.
+
+    Args:
+        runs: folders that `regil train` or `regil bench` wrote; none: all evaluated ones in `out`.
+        out: folder of ``buffer-vs-learning.md``, ``.tex``, ``.parquet`` and ``.png``.
+
+    Raises:
+        ValueError: one is no run folder, or none says enough.
+        ImportError: pyarrow is not installed.
+    """
+    name = "buffer-vs-learning"
+    need_parquet(name)
+    folders = list(runs) or [str(e.parent) for e in sorted(Path(out).glob("*/evaluation.json"))]
+    if not folders:
+        raise ValueError(f"--out {out}: no evaluated run is there; name some with --runs")
+    found, left_out = learned(folders)
+    if not found:
+        raise ValueError(f"none of these runs says enough: {'; '.join(left_out)}")
+    tasks = list(dict.fromkeys(run.task for run in found))
+    ranks = [_said("of all runs", rank(found))]
+    if len(tasks) > 1:
+        own = ([run for run in found if run.task == task] for task in tasks)
+        ranks += [_said(task, rank(r)) for task, r in zip(tasks, own, strict=True)]
+    lines = table(found)
+    below = (
+        "Buffer: transitions of whole successful episodes when the warm-up was over, the "
+        "demonstration left out. Success: last policy, unseen episodes, Wilson's interval. "
+        f"Spearman's rank correlation of both, {'; '.join(ranks)}. "
+        + "".join(f"Left out: {line}. " for line in left_out)
+        + f"Read by {describe(('numpy', 'scipy', 'regil-sb3'))}"
+    )
+    folder = Path(out)
+    write(folder, name, {"runs": runs} if runs else {}, lines, below)
+    write_rows(folder / f"{name}.parquet", [vars(run) for run in found])
+    _draw(found, folder / f"{name}.png")
+    print("\n".join([*lines, "", below]))

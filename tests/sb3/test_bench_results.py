@@ -1,0 +1,86 @@
+"""`regil bench results`: one page of the tables that are kept, and one with their plots."""
+
+from __future__ import annotations
+
+import re
+
+import made_run
+import pytest
+
+from regil_sb3.bench.page import figure, write, write_rows
+from regil_sb3.cli import main
+
+TABLE = ["| H | success |", "|---|---|", "| 4 | 0.50 |", "| **mean** | 0.25 < 1 |"]
+
+
+@pytest.fixture
+def bench(tmp_path):
+    write(tmp_path / "bench", "sensitivity", {"episodes": 7}, TABLE, "On a machine & more")
+    return tmp_path / "bench"
+
+
+def words(bench, page):
+    return ["bench", "results", "--out", str(bench), "--page", str(page)]
+
+
+def test_results_are_the_tables_that_are_kept(bench, tmp_path, capsys):
+    page = tmp_path / "results.md"
+    assert main(words(bench, page)) == 0
+    assert capsys.readouterr().out == f"{page}: sensitivity; 6 not there yet\n"
+    text = page.read_text()
+    table = "\n".join(TABLE)
+    command = "    regil bench sensitivity --episodes 7"
+    assert f"## sensitivity\n\n{command}\n\n{table}\n\nOn a machine & more\n\n## Not" in text
+    assert "* `regil bench success-buffer`\n* `regil bench ablations`" in text
+    assert text.endswith("* `regil bench trajectories --runs RUN`\n")
+    shown = (tmp_path / "results.html").read_text()
+    assert "<code>regil bench sensitivity --episodes 7</code>" in shown
+    assert "<tr><td>mean</td><td>0.25 &lt; 1</td></tr>" in shown
+    assert "On a machine &amp; more" in shown
+    assert "<li>regil bench baselines: not measured yet</li>" in shown
+    assert "<img" not in shown
+
+
+def test_learning_tables_have_plots(bench, tmp_path):
+    rows = []
+    for method, solved in (("ReGIL", (19, 17)), ("RL", (3, 5))):
+        for seed in (0, 1):
+            of = {"task": "hammer", "method": method, "seed": seed, "steps": 15_000}
+            rows += [{**of, "episode": episode} for episode in range(2)]
+            folder = bench / f"metaworld-hammer-{method}-{seed}-15000"
+            env = "regil/metaworld-hammer-v0"
+            made_run.run(folder, env, seed, solved[seed], films=False)
+    rows.append({**rows[0], "seed": 2})
+    write_rows(bench / "ablations.parquet", rows)
+    write(bench, "ablations", {}, TABLE, "there")
+    with figure(bench / "trajectories.png") as ((axis,),):
+        axis.plot([0, 1], [0, 1])
+    write(bench, "trajectories", {}, TABLE, "here")
+    assert main(words(bench, tmp_path / "results.md")) == 0
+    shown = (tmp_path / "results.html").read_text()
+    assert shown.count('src="data:image/png;base64,') == 1
+    assert re.findall(r"<b>(\d+) %</b>", shown) == ["90", "20"]
+    assert shown.count('class="spread"') == 2  # the IQM's interval, over steps
+    assert re.search(r"<td>RL</td><td>0 % \(0 to 0 %\)", shown)  # none beats one of the first
+    assert "<td>90 % (85 to 95, 2 runs)</td>" in shown
+    assert "metaworld-hammer-ReGIL-2-15000, a run of ablations, is not there any more" in shown
+
+
+@pytest.mark.parametrize(
+    ("page", "said"),
+    [
+        ("none/results.md", "there is no folder"),
+        ("results.html", "its name must end in .md"),
+    ],
+)
+def test_bad_options_get_one_line(bench, tmp_path, page, said, capsys):
+    assert main(words(bench, tmp_path / page)) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert main(words(tmp_path, tmp_path / "results.md")) == 2
+    assert "no table is there; make one: regil bench sensitivity" in capsys.readouterr().err
+    (bench / "rewards.md").write_text("half a ta")
+    assert main(words(bench, tmp_path / "results.md")) == 2
+    assert "rewards.md is no table: remove it" in capsys.readouterr().err
+    assert not (tmp_path / "results.md").exists()
