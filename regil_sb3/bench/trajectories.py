@@ -10,6 +10,7 @@ again.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -323,14 +324,16 @@ def main(runs: Sequence[str] = (), out: str = "bench", episodes: int = 10) -> No
         raise ValueError("--runs is missing: name a run that has ended")
     check((), (), episodes=episodes)
     contents = [_checked(run) for run in runs]
+    begun = time.perf_counter()
     found = [played(run, episodes) for run in contents]
+    minutes = (time.perf_counter() - begun) / 60
     lines = table(found)
     packages = ("gymnasium", "metaworld", "mujoco", "numpy", "torch", "regil-sb3")
     below = (
         "Paths begin at one point. Length, mean distance to the nearest point of the "
         "demonstration's path (both medians over episodes), and root mean square distance of the "
         f"ends from their mean. {' '.join(map(_how, found))} Policy: seeds from {EVALUATION_SEED}. "
-        f"{describe(packages)}"
+        f"{minutes:.1f} minutes; {describe(packages)}"
     )
     folder = Path(out)
     write(folder, name, {"runs": runs, "episodes": episodes}, lines, below)
