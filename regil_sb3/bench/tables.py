@@ -189,20 +189,6 @@ def _compare(
 
 TABLES: dict[str, Callable[[], list[Row]]] = {"rendering": rendering, "retrieval": retrieval}
 """Tables by name."""
-_ROOMS = (
-    "ranking",
-    "guide",
-    "success-buffer",
-    "sensitivity",
-    "buffer-vs-learning",
-    "trajectories",
-    "results",
-    "latency",
-    "memory",
-    "index",
-    "throughput",
-    "faults",
-)
 _MODULES = (  # each has one of its name
     "guide",
     "success-buffer",
@@ -211,6 +197,7 @@ _MODULES = (  # each has one of its name
     "trajectories",
     "results",
 )
+_ROOMS = ("ranking", *_MODULES, "latency", "memory", "index", "throughput", "faults")
 FAULTS = ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers")
 """Parts of the table "faults", and the options that count them."""
 _OPTIONS = {
