@@ -225,6 +225,7 @@ def train(settings: Settings, demo: Demonstration, run: Path) -> None:
                 k=settings.retrieval("k"),
                 horizon=settings.retrieval("horizon"),
                 action_repeat=action_repeat(env),
+                demo_actions=None if demo.actions is None else len(demo.actions),
             )
             _learn(model, settings, run, eval_env)
 

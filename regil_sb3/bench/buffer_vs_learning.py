@@ -73,19 +73,22 @@ def buffer_after_warmup(run: RunContents, warmup: int) -> int | None:
     """Transitions in the success buffer when the warm-up was over, without the demonstration's.
 
     Args:
-        run: with its log and its demonstration.
+        run: with its log, and its settings or its demonstration.
         warmup: agent steps of it; an episode begun in it is finished in it.
 
     Returns:
         the first that is logged once it is over; None where that is nowhere.
     """
-    if run.demo is None or run.demo.actions is None:
+    demonstrated = run.config.get("demo_actions")
+    if demonstrated is None and run.demo is not None and run.demo.actions is not None:
+        demonstrated = len(run.demo.actions)  # older runs do not say it
+    if demonstrated is None:
         return None
     for row in run.rows:
         # the policy is first evaluated as the warm-up ends; until then only the guide acts
         over = row[STEPS] >= warmup and ("eval/success_rate" in row or not row.get("time/guided"))
         if over and "success_buffer/steps" in row:
-            return int(row["success_buffer/steps"]) - len(run.demo.actions)
+            return int(row["success_buffer/steps"]) - int(demonstrated)
     return None
 
 

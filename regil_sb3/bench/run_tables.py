@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from regil_sb3.bench.machine import describe
 from regil_sb3.bench.page import need_parquet, said, write, write_rows
-from regil_sb3.bench.replay import task_of
-from regil_sb3.bench.runs import Run, finish_all, predicted_hours, seconds_of
+from regil_sb3.bench.replay import env_id, task_of
+from regil_sb3.bench.runs import Run, finish_all, machines, others, predicted_hours, seconds_of
 from regil_sb3.intervals import Interval, iqm
 
 __all__ = ["LEARNING", "main", "planned", "raw", "table"]
@@ -60,7 +59,7 @@ def planned(
     return [
         Run(
             root=str(root),
-            env=f"regil/metaworld-{task}-v0",
+            env=env_id(task),
             method=method,
             seed=seed,
             steps=steps or own["steps"],
@@ -185,6 +184,8 @@ def main(
     if workers < 1:
         raise ValueError(f"--workers {workers}: at least 1 is needed")
     runs = planned(name, out, **options)
+    if stale := others(runs):
+        raise ValueError("; ".join(stale))
     missing = [run for run in runs if not run.finished]
     if dry_run:
         for run in runs:
@@ -203,7 +204,7 @@ def main(
         hours = sum(seconds_of(run) or 0 for run in runs if run.finished) / 3600
         below = (
             f"Seeds {seeds}; {hours:.1f} hours, one run after the other; "
-            f"{describe(('gymnasium', 'metaworld', 'mujoco', 'stable-baselines3', 'torch'))}"
+            f"{'; '.join(machines(runs))}"
         )
         folder = Path(out)
         write(folder, name, options, lines, below)

@@ -3,10 +3,12 @@
 * ``Run`` - one method on one task with one seed: what `regil train` is to be given, and its folder
 * ``finish`` - trains a run to its end, or goes on with it, and evaluates it
 * ``finish_all`` - several at a time, as processes here or as tasks of a Ray cluster
-* ``predicted_hours`` - from what finished runs took
+* ``predicted_hours``, ``machines`` - from what finished runs took, and where
+* ``others`` - finished runs that were made with other settings than are asked for now
 
 A run is a folder; it is finished when it holds ``evaluation.json``. Nothing else is kept about it,
-so that any number of machines that see the folders may take part, one after the other.
+so that any number of machines that see the folders may take part, one after the other. Tables need
+of it ``config.yaml``, ``progress.csv``, ``evaluation.json`` and ``took.json`` alone.
 """
 
 from __future__ import annotations
@@ -19,13 +21,29 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-__all__ = ["Run", "finish", "finish_all", "predicted_hours", "seconds_of"]
+from regil_sb3.bench.machine import describe
+
+if TYPE_CHECKING:
+    from regil_sb3.settings import Settings
+
+__all__ = [
+    "Run",
+    "finish",
+    "finish_all",
+    "machines",
+    "others",
+    "predicted_hours",
+    "seconds_of",
+]
+
+_PACKAGES = ("gymnasium", "metaworld", "mujoco", "stable-baselines3", "torch", "regil-sb3")
 
 _SECONDS_A_STEP = 15 * 60 / 15_000  # of one core, until a run has told
 _AGAIN = 3  # times that a run that died is taken up again
@@ -79,13 +97,65 @@ class Run:
         words += [f"--set {setting}" for setting in self.settings]
         return " ".join([*words, "--out", str(self.folder)])
 
+    @property
+    def settings_now(self) -> Settings:
+        """What it is made with, if it is made now."""
+        from regil_sb3.settings import make_settings
+
+        return make_settings(
+            self.env, self.preset or None, self.seed, self.steps, list(self.settings)
+        )
+
+
+def _took(run: Run) -> dict[str, Any]:
+    try:
+        told = json.loads((run.folder / "took.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
 
 def seconds_of(run: Run) -> float | None:
     """What a finished run took, in s; None where that is not known."""
-    try:
-        return float(json.loads((run.folder / "took.json").read_text())["seconds"])
-    except (OSError, ValueError, KeyError):
-        return None
+    seconds = _took(run).get("seconds")
+    return None if seconds is None else float(seconds)
+
+
+def machines(runs: Sequence[Run]) -> list[str]:
+    """What finished runs were made on: processor, versions and commit, each once."""
+    told = [_took(run).get("machine", "a machine that is not known") for run in runs]
+    return list(dict.fromkeys(where for run, where in zip(runs, told, strict=True) if run.finished))
+
+
+def _evaluated(run: Run) -> int:
+    """Unseen episodes of the last policy."""
+    policy = json.loads((run.folder / "evaluation.json").read_text())["policy"]
+    return len(policy["successes"])
+
+
+def others(runs: Sequence[Run]) -> list[str]:
+    """A line for each run that is not the one that is asked for now.
+
+    Other settings, of one that is finished or begun; or another number of unseen episodes.
+    """
+    from regil_sb3.settings import Settings
+
+    lines = []
+    for run in runs:
+        if not (config := run.folder / "config.yaml").exists():
+            continue
+        then, now = asdict(Settings.load(config)), asdict(run.settings_now)
+        if differ := [name for name in now if then[name] != now[name]]:
+            lines.append(
+                f"{run.folder} was made with other settings ({', '.join(differ)}): "
+                "remove it, and it is made again, or name another --out"
+            )
+        elif run.finished and (count := _evaluated(run)) != run.episodes:
+            lines.append(
+                f"{run.folder} was evaluated in {count} episodes, not {run.episodes}: "
+                f"regil evaluate {run.folder} --episodes {run.episodes}"
+            )
+    return lines
 
 
 def predicted_hours(runs: Sequence[Run], workers: int) -> float:
@@ -117,7 +187,8 @@ def finish(run: Run) -> None:
         raise
     finally:
         seconds = took + time.time() - begun
-        (run.folder / "took.json").write_text(json.dumps({"seconds": seconds}))
+        told = {"seconds": seconds, "machine": describe(_PACKAGES)}
+        (run.folder / "took.json").write_text(json.dumps(told))
     if process.exitcode or not run.finished:
         raise RuntimeError(f"{run.folder} ended with status {process.exitcode}: see log.txt there")
 
@@ -136,7 +207,7 @@ def _train(run: Run) -> None:
     from regil_wrappers import Demonstration
 
     from regil_sb3 import process, training
-    from regil_sb3.settings import Settings, make_settings
+    from regil_sb3.settings import Settings
 
     process.keep_freed_memory()
     process.set_threads()
@@ -144,10 +215,7 @@ def _train(run: Run) -> None:
         if not training.has_learned(run.folder, Settings.load(config)):
             training.resume(run.folder)
     else:
-        settings = make_settings(
-            run.env, run.preset or None, run.seed, run.steps, list(run.settings)
-        )
-        training.train(settings, Demonstration.load(run.demo), run.folder)
+        training.train(run.settings_now, Demonstration.load(run.demo), run.folder)
     training.evaluate_run(run.folder, run.episodes, only=("policy", "best_policy"))
 
 

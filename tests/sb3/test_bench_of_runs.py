@@ -44,6 +44,8 @@ def test_what_the_guide_left_is_read_where_the_warmup_ends(tmp_path):
     assert buffer_after_warmup(run, 3_000) is None
     run.demo = None
     assert buffer_after_warmup(run, 2_000) is None
+    run.config["demo_actions"] = 9  # as a run says itself, whose demonstration need not be kept
+    assert buffer_after_warmup(run, 2_000) == 420
 
 
 def test_runs_that_say_too_little_are_left_out(tmp_path):

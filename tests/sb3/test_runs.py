@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ import pytest
 from toy import demonstration
 
 from regil_sb3.bench import run_tables
-from regil_sb3.bench.runs import Run, finish_all, predicted_hours, seconds_of
+from regil_sb3.bench.runs import Run, finish_all, machines, others, predicted_hours, seconds_of
 from regil_sb3.cli import main
 
 TINY = (
@@ -64,6 +66,17 @@ def test_runs_are_finished_once_and_failures_are_named(runs, failed):
     written = (runs[0].folder / "evaluation.json").stat().st_mtime_ns
     assert finish_all(runs[:2]) == []
     assert (runs[0].folder / "evaluation.json").stat().st_mtime_ns == written
+    assert len(machines(runs)) == 1
+    assert "commit" in machines(runs)[0]
+
+
+def test_runs_that_were_made_otherwise_are_named(runs, failed):
+    assert others(runs) == []
+    changed = replace(runs[0], settings=(*TINY[:-1], "eval_episodes=3", "k=4"))
+    (line,) = others([changed, runs[1]])
+    assert line.startswith(f"{runs[0].folder} was made with other settings (eval_episodes, ")
+    (line,) = others([replace(runs[0], episodes=40), runs[1]])
+    assert f"was evaluated in 3 episodes, not 40: regil evaluate {runs[0].folder}" in line
 
 
 def test_tables_are_what_evaluations_say(tmp_path):
@@ -107,7 +120,13 @@ def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
 
 
 def test_what_is_written(runs, failed, tmp_path, monkeypatch):
-    monkeypatch.setattr(run_tables, "planned", lambda *_, **__: runs[:2])
+    for run in runs[:2]:  # all that a table needs of a run
+        kept = tmp_path / run.folder.name
+        kept.mkdir()
+        for name in ("config.yaml", "evaluation.json", "progress.csv", "took.json"):
+            shutil.copy(run.folder / name, kept)
+    kept_alone = [replace(run, root=str(tmp_path)) for run in runs[:2]]
+    monkeypatch.setattr(run_tables, "planned", lambda *_, **__: kept_alone)
     run_tables.main("ablations", out=str(tmp_path))
     rows = parquet.read_table(tmp_path / "ablations.parquet").to_pylist()
     assert len(rows) == 2 * 3
