@@ -297,9 +297,11 @@ def _on_ray(
     runs: Sequence[Run], address: str, cpus: float, gpus: float, show: Callable[[], None]
 ) -> list[str]:
     try:
-        import ray  # type: ignore[import-not-found]
+        import ray
     except ModuleNotFoundError as error:
-        raise ImportError(f"Ray is not installed ({error}): pip install 'regil-sb3[ray]'") from None
+        raise ImportError(
+            f"Ray is not installed ({error}): pip install 'regil-sb3[bench]'"
+        ) from None
     if not ray.is_initialized():
         ray.init(address=None if address == "local" else address, log_to_driver=False)
     task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=_AGAIN)(finish)
