@@ -26,12 +26,12 @@ class GrabbingCamera:
 
     def __init__(self, name: str, size: tuple[int, int], rate: int) -> None:
         self.name, self._size, self._rate = name, size, rate
-        self._picture: Picture | None = None
-        self._error: str | None = None
+        self._picture: Picture | None
+        self._error: str | None
         self._start()
 
     def _start(self) -> None:
-        self._error, self._ends = None, False
+        self._picture, self._error, self._ends = None, None, False
         self._open()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
