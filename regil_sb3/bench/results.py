@@ -29,6 +29,7 @@ KEPT = {
     **dict.fromkeys(LEARNING, ""),
     "buffer-vs-learning": "",
     "trajectories": " --runs RUN",
+    "real-time": "",
 }
 """Tables that write ``NAME.md`` into their folder, and what their commands cannot do without."""
 
@@ -59,7 +60,8 @@ def main(out: str = "bench", page: str = "docs/results.md") -> None:
         if text.count("\n\n") != 2:
             raise ValueError(f"{found[name]} is no table: remove it, and it is made again")
     missing = [f"regil bench {name}{words}" for name, words in KEPT.items() if name not in found]
-    parts = ["# Results", "Written by `regil bench results`, from tables that it keeps."]
+    written = f"Written by `regil bench results --out {out}`, from the tables that are kept there."
+    parts = ["# Results", written]
     parts += [f"## {name}\n\n{text}" for name, text in texts.items()]
     if missing:
         lines = [f"* `{command}`" for command in missing]
