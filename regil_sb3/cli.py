@@ -147,7 +147,8 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument(
         "table",
         help="rendering, retrieval, ranking, guide, success-buffer, sensitivity, latency, "
-        "memory, index, throughput, faults; baselines, ablations, rewards (training runs); "
+        "real-time, memory, index, throughput, faults; "
+        "baselines, ablations, rewards (training runs); "
         "buffer-vs-learning, trajectories (of runs that have ended); results (a page of all that "
         "is kept)",
     )
@@ -155,10 +156,10 @@ def _parser() -> argparse.ArgumentParser:
         "--tasks",
         nargs="+",
         metavar="TASK",
-        help="guide, success-buffer, sensitivity: Meta-World's (the paper's 7)",
+        help="Meta-World's (the paper's 7); real-time: reach, insert, open (reach)",
     )
     bench.add_argument(
-        "--seeds", nargs="+", type=int, help="of demonstrations and runs (0 1; success-buffer: 0)"
+        "--seeds", nargs="+", type=int, help="of demonstrations and runs (0 1, or 0)"
     )
     bench.add_argument(
         "--episodes",
@@ -173,7 +174,7 @@ def _parser() -> argparse.ArgumentParser:
         help="sensitivity: so many --episodes of each task",
     )
     bench.add_argument("--disturbances", nargs="+", metavar="NAME", help="guide: (none)")
-    bench.add_argument("--steps", type=int, help="agent steps (5000; 15000)")
+    bench.add_argument("--steps", type=int, help="agent steps (5000; 15000; 3000)")
     bench.add_argument(
         "--encoders",
         nargs="+",

@@ -7,6 +7,7 @@
 * ``rewards``, ``latency``, ``memory``, ``throughput`` - measured at once
 * ``run_tables`` - tables made of many training runs, and ``runs``, which makes each run once
 * ``buffer_vs_learning``, ``trajectories`` - of runs that have ended
+* ``real_time`` - control at 30 Hz while a policy is learned
 * ``faults`` - kills, broken disks, hostile files: ``lives``, ``disk_faults``, ``hostile``
 * ``toy`` - a learner that lives for seconds
 * ``peers`` - other packages' alignments; ``machine``, ``timing`` - what it ran on, and how long

@@ -195,6 +195,7 @@ _MODULES = (  # each has one of its name
     "sensitivity",
     "buffer-vs-learning",
     "trajectories",
+    "real-time",
     "results",
 )
 _ROOMS = ("ranking", *_MODULES, "latency", "memory", "index", "throughput", "faults")
@@ -219,7 +220,7 @@ def main(table: str, **options: Any) -> list[Row]:
 
     Args:
         table: one of `TABLES`; "guide", "success-buffer", "sensitivity", "buffer-vs-learning",
-            "trajectories" or "results" (modules of their names); "ranking"
+            "trajectories", "real-time" or "results" (modules of their names); "ranking"
             (`regil_sb3.bench.rewards`); "memory" or "index" (`regil_sb3.bench.memory`); "latency",
             "throughput" or "faults" (modules of their names); or one of
             `regil_sb3.bench.run_tables.LEARNING`.

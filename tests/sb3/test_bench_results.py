@@ -26,13 +26,14 @@ def words(bench, page):
 def test_results_are_the_tables_that_are_kept(bench, tmp_path, capsys):
     page = tmp_path / "results.md"
     assert main(words(bench, page)) == 0
-    assert capsys.readouterr().out == f"{page}: sensitivity; 6 not there yet\n"
+    assert capsys.readouterr().out == f"{page}: sensitivity; 7 not there yet\n"
     text = page.read_text()
     table = "\n".join(TABLE)
     command = "    regil bench sensitivity --episodes 7"
     assert f"## sensitivity\n\n{command}\n\n{table}\n\nOn a machine & more\n\n## Not" in text
     assert "* `regil bench success-buffer`\n* `regil bench ablations`" in text
-    assert text.endswith("* `regil bench trajectories --runs RUN`\n")
+    assert "* `regil bench trajectories --runs RUN`\n" in text
+    assert text.endswith("* `regil bench real-time`\n")
     shown = (tmp_path / "results.html").read_text()
     assert "<code>regil bench sensitivity --episodes 7</code>" in shown
     assert "<tr><td>mean</td><td>0.25 &lt; 1</td></tr>" in shown

@@ -1,0 +1,234 @@
+"""`regil bench real-time`: how regular control at 30 Hz is while a policy is learned.
+
+The rehearsal robot by the wall clock, with irregular and lost pictures, in whole training runs: the
+guide acts first, then the policy. Once the updates run beside control, and once in turn with it, as
+`TD3BC` alone does. One after the other: whatever else runs on the machine is part of what is
+measured.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import psutil
+from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from tqdm import tqdm
+
+import regil_sb3  # registers the environments  # noqa: F401
+from regil_sb3 import process
+from regil_sb3.background import BackgroundTD3BC
+from regil_sb3.bench.cells import Cell, below, finish
+from regil_sb3.bench.page import write
+from regil_sb3.recording import check_seeds, record_expert
+from regil_sb3.td3bc import TD3BC
+
+__all__ = ["SIDES", "controlled", "main", "planned", "table"]
+
+SIDES: dict[str, type[TD3BC]] = {"beside control": BackgroundTD3BC, "in turn": TD3BC}
+"""Where the updates run."""
+
+_HERTZ = 30
+_TASKS = ("reach", "insert", "open")
+_GUIDED = 0.2  # of the steps, but at most so many:
+_MOST_GUIDED = 1_000
+_PRETRAINED = 2_000  # updates at the end of the guided steps
+
+
+class _Memory(BaseCallback):
+    """MB of this process, once a minute of control; and how far it is."""
+
+    def __init__(self, side: str, steps: int) -> None:
+        super().__init__()
+        self.megabytes: list[int] = []
+        self.bar = tqdm(
+            total=steps, desc=side, unit="step", position=1, leave=False, dynamic_ncols=True
+        )
+
+    def _on_step(self) -> bool:
+        self.bar.update()
+        if self.n_calls % (60 * _HERTZ) == 0:
+            self.megabytes.append(round(psutil.Process().memory_info().rss / 1e6))
+        return True
+
+
+def controlled(task: str, seed: int, steps: int, side: str) -> dict[str, Any]:
+    """Learn a task of the rehearsal robot by the wall clock.
+
+    Args:
+        task: reach, insert or open.
+        seed: of demonstration, networks and sampling.
+        steps: of control, guided ones included.
+        side: of `SIDES`.
+
+    Returns:
+        ``steps``, ``missed`` deadlines, ``answer_ms`` (an observation to its action) and
+        ``period_ms`` with median, p99 and max; ``updates``, ``megabytes`` after each minute,
+        ``faults`` for which the watchdog stopped the arm, and ``recent_success`` of the last
+        ``episodes``.
+    """
+    process.keep_freed_memory()
+    process.set_threads()
+    name = f"regil/rehearsal-{task}-v0"
+    demo = record_expert(name, seed, {"random_object": False})
+    with tempfile.TemporaryDirectory() as folder:
+        robot = gym.make(name, real_time=True, jitter=0.003, dropped=0.01, record_to=folder)
+        times: Any = robot.unwrapped
+        env: gym.Env[Any, Any] = RetrievalGuideWrapper(
+            robot, demo=demo, register=True, correction="servo", disturbance=0.4
+        )
+        env = RetrievalRewardWrapper(env, demo=demo, register=True, reward="progress")
+        envs = VecFrameStack(DummyVecEnv([lambda: Monitor(env)]), 2)
+        model = SIDES[side](
+            "CnnPolicy",
+            envs,
+            demo=demo,
+            warmup_steps=min(round(_GUIDED * steps), _MOST_GUIDED),
+            actor_in_warmup=False,
+            bc_pretrain_steps=_PRETRAINED,
+            bc_schedule="success",
+            bc_floor=0.5,
+            keep_own_successes=True,
+            policy_kwargs={"shared_encoder": False, "q_trains_encoder": False},
+            seed=seed,
+        )
+        memory = _Memory(side, steps)
+        try:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                model.learn(steps, memory)
+        finally:
+            memory.bar.close()
+            envs.close()
+    said = [str(warning.message) for warning in caught]
+    recent = list(model.ep_success_buffer or ())
+    return {
+        **times.times.summary(),
+        "updates": model._n_updates,
+        "megabytes": memory.megabytes,
+        "faults": [line for line in said if "stopped" in line],
+        "recent_success": sum(map(bool, recent)),
+        "episodes": len(recent),
+    }
+
+
+def planned(
+    out: str = "bench",
+    tasks: Sequence[str] = ("reach",),
+    seeds: Sequence[int] = (0,),
+    steps: int = 3_000,
+) -> dict[tuple[str, str], list[Cell]]:
+    """What is to be measured: by task and side, a cell for each seed.
+
+    Args:
+        out: folder in which cells are kept.
+        tasks: of the rehearsal robot.
+        seeds: of `controlled`.
+        steps: likewise.
+
+    Raises:
+        ValueError: an option cannot be measured.
+    """
+    for task in tasks:
+        if task not in _TASKS:
+            raise ValueError(f"--tasks {task}: choose from {', '.join(_TASKS)}")
+    for seed in seeds:
+        check_seeds(seed)
+    if steps < 1_000:
+        raise ValueError(
+            f"--steps {steps}: at least 1000 are needed, of which the first are guided"
+        )
+    plan: dict[tuple[str, str], list[Cell]] = {}
+    for task in tasks:
+        for side in SIDES:
+            plan[task, side] = [
+                Cell(
+                    Path(out) / "cells",
+                    {
+                        "measured": "control in real time",
+                        "env": f"regil/rehearsal-{task}-v0",
+                        "seed": seed,
+                        "steps": steps,
+                        "updates": side,
+                    },
+                    partial(controlled, task, seed, steps, side),
+                    steps / _HERTZ,
+                )
+                for seed in seeds
+            ]
+    return plan
+
+
+def table(plan: dict[tuple[str, str], list[Cell]]) -> list[str]:
+    """The table in Markdown: a line a run."""
+    lines = [
+        "| task | updates | seed | steps | updates made | control step, ms: median / 99 % / most | "
+        "period, ms: median / 99 % / most | missed | arm stopped | MB | recent success |",
+        "|" + "---|" * 11,
+    ]
+    for (task, side), cells in plan.items():
+        for cell in cells:
+            found = cell.found
+            answer, period = (
+                " / ".join(f"{found[name][at]:.3g}" for at in ("median", "p99", "max"))
+                for name in ("answer_ms", "period_ms")
+            )
+            megabytes = found["megabytes"]
+            values = (
+                task,
+                side,
+                cell.asked["seed"],
+                f"{found['steps']:,}",
+                f"{found['updates']:,}",
+                answer,
+                period,
+                found["missed"],
+                len(found["faults"]),
+                f"{megabytes[0]:,} to {megabytes[-1]:,}" if megabytes else "-",
+                f"{found['recent_success']} of {found['episodes']}",
+            )
+            lines.append("| " + " | ".join(map(str, values)) + " |")
+    return lines
+
+
+def main(
+    out: str = "bench",
+    dry_run: bool = False,
+    tasks: Sequence[str] = ("reach",),
+    seeds: Sequence[int] = (0,),
+    steps: int = 3_000,
+) -> None:
+    """Measure what is not kept, and print the table.
+
+    Args:
+        out: folder of kept cells, and of ``real-time.md`` and ``.tex``.
+        dry_run: print the cells and the predicted hours, and measure none.
+        tasks: as for `planned`.
+        seeds: likewise.
+        steps: likewise.
+
+    Raises:
+        ValueError: an option cannot be measured.
+    """
+    plan = planned(out, tasks, seeds, steps)
+    cells = [cell for of in plan.values() for cell in of]
+    finish(cells, dry_run)
+    if dry_run:
+        return
+    lines = table(plan)
+    said = (
+        f"The rehearsal robot at {_HERTZ} Hz by the wall clock, pictures 3 ms early or late and "
+        f"1 % of them lost; default preset. MB after the first and after the last minute. "
+        f"{below(cells)}"
+    )
+    options = {"tasks": tasks, "seeds": seeds, "steps": steps}
+    write(Path(out), "real-time", options, lines, said)
+    print("\n".join([*lines, "", said]))
