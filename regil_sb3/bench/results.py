@@ -13,9 +13,7 @@ import html
 from collections.abc import Sequence
 from pathlib import Path
 
-from regil_sb3.bench.replay import env_id
 from regil_sb3.bench.run_tables import LEARNING
-from regil_sb3.bench.runs import Run
 from regil_sb3.files import replacing
 from regil_sb3.report.comparison import NOTE, plots, scores
 from regil_sb3.report.page import card, write_page
@@ -82,16 +80,23 @@ def _learning(out: Path, name: str) -> tuple[str, list[str]]:
     """Plots of a table's runs, and a line for each run that is not there any more."""
     from pyarrow import parquet  # type: ignore[import-untyped]
 
-    keys = ["task", "method", "seed", "steps"]
-    table = parquet.read_table(out / f"{name}.parquet", columns=keys)
+    rows = out / f"{name}.parquet"
+    columns = parquet.read_table(rows).to_pydict()
+    try:
+        of_rows = zip(columns["method"], columns["run"], columns["evaluated"], strict=True)
+    except KeyError as error:
+        raise ValueError(
+            f"{rows} has no column {error}: regil bench {name} makes it anew"
+        ) from None
     named: dict[str, list[RunContents]] = {}
     gone = []
-    for task, method, seed, steps in dict.fromkeys(zip(*table.to_pydict().values(), strict=True)):
-        run = Run(str(out), env_id(task), method, seed, steps, demo="")
-        if run.finished:
-            named.setdefault(method, []).append(read_run(run.folder))
+    for method, run, evaluated in dict.fromkeys(of_rows):
+        if evaluated != "policy":
+            continue  # it learned nothing
+        if (out / run / "evaluation.json").exists():
+            named.setdefault(method, []).append(read_run(out / run))
         else:
-            gone.append(f"{run.folder}, a run of {name}, is not there any more")
+            gone.append(f"{out / run}, a run of {name}, is not there any more")
     return scores(named) + plots(named) if named else "", gone
 
 

@@ -66,6 +66,8 @@ def planned(
             episodes=episodes or own["episodes"],
             preset=asked.get("preset", ""),
             settings=tuple(asked.get("settings", ())),
+            called=asked.get("run", ""),
+            beside=tuple(asked.get("beside", {}).items()),
             demo=str(Path(root) / "demos" / f"{task}-{seed}.hdf5"),
         )
         for task in tasks or own["tasks"]
@@ -76,23 +78,30 @@ def planned(
 
 
 def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
-    """What finished runs found: a row for each run and unseen episode."""
+    """What finished runs found: a row for each run, what acted, and unseen episode.
+
+    Of what is evaluated beside a run's policy, and learns nothing, steps and minutes are NaN.
+    """
     for run in runs:
         if not run.finished:
             continue
-        policy = json.loads((run.folder / "evaluation.json").read_text())["policy"]
-        for episode, success in enumerate(policy["successes"]):
-            yield {
-                "task": task_of(run.env),
-                "method": run.method,
-                "seed": run.seed,
-                "steps": run.steps,
-                "episode": episode,
-                "success": bool(success),
-                "length": int(policy["lengths"][episode]),
-                "minutes": (seconds_of(run) or np.nan) / 60,
-                **{f"steps to {level}": _steps_to(run, level) for level in LEVELS},
-            }
+        evaluation = json.loads((run.folder / "evaluation.json").read_text())
+        reached = {f"steps to {level}": _steps_to(run, level) for level in LEVELS}
+        learned = {"minutes": (seconds_of(run) or np.nan) / 60, **reached}
+        for method, name in ((run.method, "policy"), *run.beside):
+            for episode, success in enumerate(evaluation[name]["successes"]):
+                yield {
+                    "task": task_of(run.env),
+                    "method": method,
+                    "run": run.folder.name,
+                    "evaluated": name,
+                    "seed": run.seed,
+                    "steps": run.steps,
+                    "episode": episode,
+                    "success": bool(success),
+                    "length": int(evaluation[name]["lengths"][episode]),
+                    **(learned if name == "policy" else dict.fromkeys(learned, np.nan)),
+                }
 
 
 def _steps_to(run: Run, level: float) -> float:
@@ -142,7 +151,8 @@ def table(runs: Sequence[Run]) -> list[str]:
         found = iqm(scores)
         reached = [_median(by_run.values(), f"steps to {level}") for level in LEVELS]
         minutes = np.mean([row["minutes"] for row in by_run.values()])
-        cells += [_interval(found), str(len(by_run)), *reached, f"{minutes:.1f}"]
+        took = "-" if np.isnan(minutes) else f"{minutes:.1f}"
+        cells += [_interval(found), str(len(by_run)), *reached, took]
         lines.append(f"| {method} | " + " | ".join(cells) + " |")
     return lines
 

@@ -6,9 +6,9 @@
 * ``predicted_hours``, ``machines`` - from what finished runs took, and where
 * ``others`` - finished runs that were made with other settings than are asked for now
 
-A run is a folder; it is finished when it holds ``evaluation.json``. Nothing else is kept about it,
-so that any number of machines that see the folders may take part, one after the other. Tables need
-of it ``config.yaml``, ``progress.csv``, ``evaluation.json`` and ``took.json`` alone.
+A run is a folder; it is finished when its ``evaluation.json`` says enough. Nothing else is kept
+about it, so that any number of machines that see the folders may take part, one after the other.
+Tables need of it ``config.yaml``, ``progress.csv``, ``evaluation.json`` and ``took.json`` alone.
 """
 
 from __future__ import annotations
@@ -65,6 +65,10 @@ class Run:
         episodes: unseen episodes at the end.
         preset: section of the zoo's YAML; "" takes the environment's own.
         settings: "KEY=VALUE" on top of it.
+        called: its name in the folder's, where a run is shared that another table calls otherwise;
+            "": ``method``.
+        beside: what else is evaluated in it, a name in tables and one of
+            `regil_sb3.evaluation.METHODS` each.
     """
 
     root: str
@@ -76,17 +80,25 @@ class Run:
     episodes: int = 40
     preset: str = ""
     settings: tuple[str, ...] = ()
+    called: str = ""
+    beside: tuple[tuple[str, str], ...] = ()
 
     @property
     def folder(self) -> Path:
         """Where it is: task, method, seed and steps tell it from all others."""
         task = self.env.rpartition("/")[2].removesuffix("-v0")
-        return Path(self.root) / f"{task}-{self.method}-{self.seed}-{self.steps}"
+        name = self.called or self.method
+        return Path(self.root) / f"{task}-{name}-{self.seed}-{self.steps}"
 
     @property
     def finished(self) -> bool:
-        """Whether it is trained and evaluated."""
-        return (self.folder / "evaluation.json").exists()
+        """Whether it is trained and evaluated, in as many episodes and as all that is asked for."""
+        try:
+            found = json.loads((self.folder / "evaluation.json").read_text())
+        except FileNotFoundError:
+            return False
+        names = ("policy", *dict(self.beside).values())
+        return all(len(found.get(name, {}).get("successes", ())) == self.episodes for name in names)
 
     @property
     def command(self) -> str:
@@ -127,16 +139,11 @@ def machines(runs: Sequence[Run]) -> list[str]:
     return list(dict.fromkeys(where for run, where in zip(runs, told, strict=True) if run.finished))
 
 
-def _evaluated(run: Run) -> int:
-    """Unseen episodes of the last policy."""
-    policy = json.loads((run.folder / "evaluation.json").read_text())["policy"]
-    return len(policy["successes"])
-
-
 def others(runs: Sequence[Run]) -> list[str]:
     """A line for each run that is not the one that is asked for now.
 
-    Other settings, of one that is finished or begun; or another number of unseen episodes.
+    Of one that is finished or begun, other settings; of one whose model is gone, an evaluation that
+    is not enough.
     """
     from regil_sb3.settings import Settings
 
@@ -150,10 +157,12 @@ def others(runs: Sequence[Run]) -> list[str]:
                 f"{run.folder} was made with other settings ({', '.join(differ)}): "
                 "remove it, and it is made again, or name another --out"
             )
-        elif run.finished and (count := _evaluated(run)) != run.episodes:
+            continue
+        evaluated, model = (run.folder / name for name in ("evaluation.json", "model.zip"))
+        if evaluated.exists() and not run.finished and not model.exists():
             lines.append(
-                f"{run.folder} was evaluated in {count} episodes, not {run.episodes}: "
-                f"regil evaluate {run.folder} --episodes {run.episodes}"
+                f"{run.folder} was evaluated in other episodes, or as less, than is asked for, "
+                "and its model is gone: remove it, and it is made again, or name another --out"
             )
     return lines
 
@@ -216,7 +225,8 @@ def _train(run: Run) -> None:
             training.resume(run.folder)
     else:
         training.train(run.settings_now, Demonstration.load(run.demo), run.folder)
-    training.evaluate_run(run.folder, run.episodes, only=("policy", "best_policy"))
+    only = ("policy", "best_policy", *dict(run.beside).values())
+    training.evaluate_run(run.folder, run.episodes, only=only)
 
 
 def finish_all(

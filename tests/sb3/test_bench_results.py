@@ -46,12 +46,13 @@ def test_learning_tables_have_plots(bench, tmp_path):
     rows = []
     for method, solved in (("ReGIL", (19, 17)), ("RL", (3, 5))):
         for seed in (0, 1):
-            of = {"task": "hammer", "method": method, "seed": seed, "steps": 15_000}
-            rows += [{**of, "episode": episode} for episode in range(2)]
             folder = bench / f"metaworld-hammer-{method}-{seed}-15000"
+            of = {"task": "hammer", "method": method, "seed": seed, "run": folder.name}
+            rows += [{**of, "evaluated": "policy", "episode": episode} for episode in range(2)]
             env = "regil/metaworld-hammer-v0"
             made_run.run(folder, env, seed, solved[seed], films=False)
-    rows.append({**rows[0], "seed": 2})
+    rows.append({**rows[0], "run": "metaworld-hammer-ReGIL-2-15000"})
+    rows.append({**rows[0], "method": "guide", "evaluated": "guide"})  # has no curve
     write_rows(bench / "ablations.parquet", rows)
     write(bench, "ablations", {}, TABLE, "there")
     with figure(bench / "trajectories.png") as ((axis,),):

@@ -75,13 +75,34 @@ def test_runs_that_were_made_otherwise_are_named(runs, failed):
     changed = replace(runs[0], settings=(*TINY[:-1], "eval_episodes=3", "k=4"))
     (line,) = others([changed, runs[1]])
     assert line.startswith(f"{runs[0].folder} was made with other settings (eval_episodes, ")
-    (line,) = others([replace(runs[0], episodes=40), runs[1]])
-    assert f"was evaluated in 3 episodes, not 40: regil evaluate {runs[0].folder}" in line
+    for more in ({"episodes": 4}, {"beside": (("replay", "guide"),)}):  # its model is there
+        again = replace(runs[0], **more)
+        assert not again.finished
+        assert others([again]) == []
+
+
+def test_more_is_evaluated_of_a_run_that_has_learned(runs, failed, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")]))
+    shutil.copytree(runs[1].folder, tmp_path / runs[1].folder.name)
+    run = replace(runs[1], root=str(tmp_path), episodes=2, beside=(("replay", "guide"),))
+    learned = (run.folder / "model.zip").read_bytes()
+    assert finish_all([run]) == []
+    assert run.finished
+    assert (run.folder / "model.zip").read_bytes() == learned
+    rows = list(run_tables.raw([run]))
+    assert [row["method"] for row in rows] == ["ReGIL"] * 2 + ["replay"] * 2
+    assert rows[0]["minutes"] > 0
+    assert np.isnan(rows[2]["minutes"])
+    assert run_tables.table([run])[-1].endswith("| 1 | - | - | - |")
+    (run.folder / "model.zip").unlink()
+    assert others([run]) == []
+    (line,) = others([replace(run, episodes=3)])
+    assert "its model is gone: remove it" in line
 
 
 def test_tables_are_what_evaluations_say(tmp_path):
     def done(task, method, seed, successes, reached):
-        run = Run(str(tmp_path), f"regil/metaworld-{task}-v0", method, seed, 15_000, "")
+        run = Run(str(tmp_path), f"regil/metaworld-{task}-v0", method, seed, 15_000, "", 4)
         run.folder.mkdir()
         policy = {"successes": successes, "lengths": [9] * len(successes)}
         (run.folder / "evaluation.json").write_text(json.dumps({"policy": policy}))
@@ -111,6 +132,8 @@ def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert main(["bench", "ablations", "--dry-run"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 2 * 2 * 5 + 1
+    assert main(["bench", "rewards", "--dry-run", "--methods", "progress"]) == 0
+    assert "metaworld-button-press-ReGIL-0-15000: " in capsys.readouterr().out
     assert said[-1] == "20 of 20 runs to make: about 5.0 hours, 1 at a time"
     assert any("--preset ablation-rl " in line for line in said)
     assert not list(tmp_path.iterdir())
