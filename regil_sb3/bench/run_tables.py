@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +163,18 @@ def _median(rows: Iterable[dict[str, Any]], column: str) -> str:
     return f"{value:,.0f}" if np.isfinite(value) else "-"
 
 
+def _paper_reached(rows: Sequence[Mapping[str, Any]]) -> str:
+    """When the paper's methods reached .95, of those that rows are of."""
+    told = ""
+    shown = {(row["task"], row["method"]) for row in rows}
+    for task, methods in said()["paper"]["frames to 0.95"].items():
+        for method, (first, last) in methods.items():
+            if (task, method) in shown:
+                told += f"The paper's {method} reaches .95 on {task} after {first:,} to {last:,} "
+                told += "frames (two an agent step). "
+    return told
+
+
 def _interval(found: Interval) -> str:
     if np.isnan(found.low):
         return f"{found.value:.3f}"
@@ -213,7 +225,7 @@ def main(
         seeds = ", ".join(map(str, sorted({row["seed"] for row in rows})))
         hours = sum(seconds_of(run) or 0 for run in runs if run.finished) / 3600
         below = (
-            f"Seeds {seeds}; {hours:.1f} hours, one run after the other; "
+            f"{_paper_reached(rows)}Seeds {seeds}; {hours:.1f} hours, one run after the other; "
             f"{'; '.join(machines(runs))}"
         )
         folder = Path(out)

@@ -124,7 +124,9 @@ def test_tables_are_what_evaluations_say(tmp_path):
     assert cells[:3] == ["ReGIL", "0.875 (0.97)", "1.000 (0.91)"]
     assert cells[4:7] == ["3", "10,000", "-"]
     assert [cell.strip() for cell in rl.strip("|").split("|")][:3] == ["RL", "-", "0.000"]
-    assert len(list(run_tables.raw(runs))) == 16
+    assert len(rows := list(run_tables.raw(runs))) == 16
+    assert "50,000 to 100,000 frames" in run_tables._paper_reached(rows)
+    assert not run_tables._paper_reached(rows[8:])  # hammer's
 
 
 def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
