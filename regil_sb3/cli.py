@@ -205,6 +205,8 @@ def _parser() -> argparse.ArgumentParser:
     for part in ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers"):
         bench.add_argument(f"--{part}", type=int, metavar="N", help="faults: so many (all parts)")
     bench.add_argument("--ray", metavar="ADDRESS", help="training runs: on a Ray cluster, or local")
+    for share, text in (("cpus", "CPUs (1)"), ("gpus", "GPUs (0)"), ("memory", "GiB (not asked)")):
+        bench.add_argument(f"--{share}", type=float, metavar="N", help=f"--ray: a run's {text}")
     return parser
 
 

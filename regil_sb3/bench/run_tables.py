@@ -187,6 +187,9 @@ def main(
     dry_run: bool = False,
     workers: int = 1,
     ray: str = "",
+    cpus: float = 1,
+    gpus: float = 0,
+    memory: float = 0,
     **options: Any,
 ) -> None:
     """Make what is missing of a table, and print it.
@@ -197,6 +200,9 @@ def main(
         dry_run: print the runs and the predicted hours, and make none.
         workers: runs at a time.
         ray: address of a Ray cluster to run on; "local" starts one.
+        cpus: that Ray gives to a run.
+        gpus: likewise.
+        memory: GiB, likewise; 0 asks for none.
         **options: of `planned`.
 
     Raises:
@@ -218,7 +224,7 @@ def main(
         )
         return
     need_parquet(name)
-    failed = finish_all(runs, workers, ray)
+    failed = finish_all(runs, workers, ray, cpus, gpus, memory)
     rows = list(raw(runs))
     if rows:
         lines = table(runs)

@@ -19,7 +19,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -230,7 +230,12 @@ def _train(run: Run) -> None:
 
 
 def finish_all(
-    runs: Sequence[Run], workers: int = 1, ray: str = "", cpus: float = 1, gpus: float = 0
+    runs: Sequence[Run],
+    workers: int = 1,
+    ray: str = "",
+    cpus: float = 1,
+    gpus: float = 0,
+    memory: float = 0,
 ) -> list[str]:
     """Finish every run that is not; several at a time.
 
@@ -239,16 +244,21 @@ def finish_all(
         workers: processes at a time, without Ray.
         ray: address of a Ray cluster, or "auto"; "local" starts one here. Its nodes must see the
             runs' folder under the same path. "": none.
-        cpus: that Ray gives to a run.
+        cpus: that Ray gives to a run; two of .5 share one.
         gpus: likewise.
+        memory: GiB, likewise; 0 asks for none.
 
     Returns:
         one line for each run that could not be finished.
 
     Raises:
         ImportError: Ray is not installed.
+        ValueError: no node of the cluster has a run's share.
         KeyboardInterrupt: passed on once all runs have saved themselves.
     """
+    shares = {"CPU": cpus, "GPU": gpus, "memory": memory * 2**30}
+    if min(shares.values()) < 0:
+        raise ValueError(f"a run cannot have {_as_said(shares)}: a share is 0 or more")
     todo = [run for run in runs if not run.finished]
     if not todo:
         return []
@@ -262,7 +272,7 @@ def finish_all(
             bar.refresh()
 
         bar.n = bar.initial = sum(_steps_done(run) for run in todo)
-        results = _on_ray(todo, ray, cpus, gpus, show) if ray else _here(todo, workers, show)
+        results = _on_ray(todo, ray, shares, show) if ray else _here(todo, workers, show)
         return [
             f"{run.folder.name}: {error}" for run, error in zip(todo, results, strict=True) if error
         ]
@@ -303,8 +313,16 @@ def _here(runs: Sequence[Run], workers: int, show: Callable[[], None]) -> list[s
     return [str(future.exception() or "") for future in futures]
 
 
+def _as_said(shares: Mapping[str, float]) -> str:
+    cpus, gpus, memory = shares["CPU"], shares["GPU"], shares["memory"] / 2**30
+    return f"{cpus:g} CPUs, {gpus:g} GPUs and {memory:.3g} GiB"
+
+
 def _on_ray(
-    runs: Sequence[Run], address: str, cpus: float, gpus: float, show: Callable[[], None]
+    runs: Sequence[Run],
+    address: str,
+    shares: Mapping[str, float],
+    show: Callable[[], None],
 ) -> list[str]:
     try:
         import ray
@@ -314,7 +332,20 @@ def _on_ray(
         ) from None
     if not ray.is_initialized():
         ray.init(address=None if address == "local" else address, log_to_driver=False)
-    task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=_AGAIN)(finish)
+    alive = [node for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+    nodes = [node["Resources"] for node in alive]
+    if not any(all(has.get(name, 0) >= share for name, share in shares.items()) for has in nodes):
+        wanted = _as_said(shares)
+        raise ValueError(
+            f"no node of the Ray cluster has {wanted} for a run; there are: "
+            + "; ".join(_as_said({name: has.get(name, 0) for name in shares}) for has in nodes)
+        )
+    task = ray.remote(
+        num_cpus=shares["CPU"],
+        num_gpus=shares["GPU"],
+        memory=int(shares["memory"]),
+        max_retries=_AGAIN,
+    )(finish)
     pending = references = [task.remote(run) for run in runs]
     while pending:
         _, pending = ray.wait(pending, num_returns=len(pending), timeout=_SHOWN_EVERY)

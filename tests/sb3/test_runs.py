@@ -139,7 +139,8 @@ def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert said[-1] == "20 of 20 runs to make: about 5.0 hours, 1 at a time"
     assert any("--preset ablation-rl " in line for line in said)
     assert not list(tmp_path.iterdir())
-    for words in (["--methods", "magic"], ["--workers", "0"], ["--plot", "x"]):
+    negative = ["--gpus", "-1"]
+    for words in (["--methods", "magic"], ["--workers", "0"], ["--plot", "x"], negative):
         assert main(["bench", "ablations", *words]) == 2
         assert capsys.readouterr().err.count("\n") == 1
 
@@ -206,6 +207,8 @@ def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
     try:
         lost = cluster.add_node(**memory)
         ray.init(address=cluster.address, log_to_driver=False)
+        with pytest.raises(ValueError, match=r"no node .* 1 CPUs, 1 GPUs and 0 GiB for a run"):
+            finish_all(runs, ray="auto", gpus=1)
 
         def kill() -> None:
             while sum((run.folder / "progress.csv").exists() for run in runs) < 2:
@@ -214,7 +217,7 @@ def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
 
         killer = threading.Thread(target=kill)
         killer.start()
-        assert finish_all(runs, ray="auto") == []
+        assert finish_all(runs, ray="auto", memory=0.5) == []
         killer.join()
         assert all(run.finished for run in runs)
         policies = [(run.folder / "log.txt").read_text().count("evaluating policy") for run in runs]
