@@ -363,7 +363,8 @@ def evaluate_run(
         only: which of `METHODS`; BC, which has to be trained, is not where it is not asked for.
 
     Returns:
-        What was written.
+        What was written; of what was ``asked``, what the run has: a guide that was never calibrated
+        is not corrected.
 
     Raises:
         ValueError: no run folder, or one without a model.
@@ -408,6 +409,7 @@ def evaluate_run(
             if name == "policy":
                 policy_result = result
         results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
+        results["asked"] = [name for name in METHODS if name in only]
     with replacing(run / "evaluation.json") as file:
         file.write(json.dumps(results, indent=1).encode())
     episode = policy_result.first_episode({**demo.metadata, "seed": EVALUATION_SEED})

@@ -89,6 +89,8 @@ def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
         reached = {f"steps to {level}": _steps_to(run, level) for level in LEVELS}
         learned = {"minutes": (seconds_of(run) or np.nan) / 60, **reached}
         for method, name in ((run.method, "policy"), *run.beside):
+            if name not in evaluation:
+                continue  # it was asked for, and the run has none
             for episode, success in enumerate(evaluation[name]["successes"]):
                 yield {
                     "task": task_of(run.env),

@@ -84,7 +84,9 @@ def test_runs_that_were_made_otherwise_are_named(runs, failed):
 def test_more_is_evaluated_of_a_run_that_has_learned(runs, failed, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")]))
     shutil.copytree(runs[1].folder, tmp_path / runs[1].folder.name)
-    run = replace(runs[1], root=str(tmp_path), episodes=2, beside=(("replay", "guide"),))
+    # "corrected" it does not have: its guide is never calibrated
+    beside = (("replay", "guide"), ("corrected", "corrected_guide"))
+    run = replace(runs[1], root=str(tmp_path), episodes=2, beside=beside)
     learned = (run.folder / "model.zip").read_bytes()
     assert finish_all([run]) == []
     assert run.finished
