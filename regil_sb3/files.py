@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedWriter
@@ -13,13 +14,20 @@ __all__ = ["replacing", "sync_folder", "write_durably"]
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BufferedWriter]:
-    """Write beside the old file, then replace it in one step: a failed write loses nothing."""
-    temporary = path.with_name(f".{path.name}")
-    with temporary.open("wb") as file:
-        yield file
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    """Write beside the old file, then replace it in one step: a failed write loses nothing.
+
+    Several processes, on several machines, may write the same file: the last one's is kept.
+    """
+    temporary = path.with_name(f".{path.name}.{platform.node()}.{os.getpid()}")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def write_durably(path: Path, content: memoryview) -> None:

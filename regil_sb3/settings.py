@@ -15,6 +15,7 @@ import yaml
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper, make_encoder
 
 from regil_sb3.baselines import BAKU, BC, ROT, ReverseForwardCurriculum
+from regil_sb3.files import replacing
 from regil_sb3.td3bc import TD3BC
 
 ALGOS: dict[str, type[TD3BC] | type[BAKU]] = {"td3bc": TD3BC, "bc": BC, "rot": ROT, "baku": BAKU}
@@ -87,7 +88,8 @@ class Settings:
         """Write ``config.yaml``; ``facts`` (encoder, versions, ...) go beside the settings."""
         versions = {name: version(name) for name in ("regil-sb3", "stable-baselines3", "torch")}
         text = yaml.safe_dump({**asdict(self), **facts, "versions": versions}, sort_keys=False)
-        path.write_text(text, encoding="utf-8")
+        with replacing(path) as file:
+            file.write(text.encode())
 
     @classmethod
     def load(cls, path: Path) -> Settings:
@@ -220,6 +222,8 @@ def make_settings(
     if settings.algo != "td3bc":  # another algorithm takes what it shares with ours
         settings.hyperparams = {k: v for k, v in settings.hyperparams.items() if k in known}
     settings.env_wrapper += changes.pop("env_wrapper", [])  # outside the others
+    if settings.policy != "CnnPolicy":  # other policies have no encoder that could be shared
+        changes = {k: v for k, v in changes.items() if not k.startswith("policy_kwargs.")}
     for key, value in {**changes, **pairs(overrides or [])}.items():
         _override(settings, key, value)
     if steps is not None:

@@ -255,7 +255,7 @@ def resume(run: Path) -> Settings:
                 "this one"
             )
         with _environments(settings, run / "demo.hdf5") as (env, eval_env):
-            if offline:
+            if offline and (run / "model.zip").exists():
                 model = ALGOS[settings.algo].load(run / "model.zip", env=env, demo=demo)
             else:
                 model = _new_model(settings, demo, env)

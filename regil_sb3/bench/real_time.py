@@ -11,13 +11,14 @@ from __future__ import annotations
 import tempfile
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import psutil
-from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
@@ -29,6 +30,7 @@ from regil_sb3.background import BackgroundTD3BC
 from regil_sb3.bench.cells import Cell, below, finish
 from regil_sb3.bench.page import write
 from regil_sb3.recording import check_seeds, record_expert
+from regil_sb3.settings import make_settings
 from regil_sb3.td3bc import TD3BC
 
 __all__ = ["SIDES", "controlled", "main", "planned", "table"]
@@ -38,9 +40,7 @@ SIDES: dict[str, type[TD3BC]] = {"beside control": BackgroundTD3BC, "in turn": T
 
 _HERTZ = 30
 _TASKS = ("reach", "insert", "open")
-_GUIDED = 0.2  # of the steps, but at most so many:
-_MOST_GUIDED = 1_000
-_PRETRAINED = 2_000  # updates at the end of the guided steps
+_GUIDED = 0.2  # of the steps, where that is less than the preset's
 
 
 class _Memory(BaseCallback):
@@ -78,27 +78,24 @@ def controlled(task: str, seed: int, steps: int, side: str) -> dict[str, Any]:
     process.keep_freed_memory()
     process.set_threads()
     name = f"regil/rehearsal-{task}-v0"
+    settings = make_settings(name, seed=seed)
+    guided = min(round(_GUIDED * steps), settings.warmup_steps)
     demo = record_expert(name, seed, {"random_object": False})
     with tempfile.TemporaryDirectory() as folder:
-        robot = gym.make(name, real_time=True, jitter=0.003, dropped=0.01, record_to=folder)
-        times: Any = robot.unwrapped
-        env: gym.Env[Any, Any] = RetrievalGuideWrapper(
-            robot, demo=demo, register=True, correction="servo", disturbance=0.4
+        env: gym.Env[Any, Any] = gym.make(
+            name, real_time=True, jitter=0.003, dropped=0.01, record_to=folder
         )
-        env = RetrievalRewardWrapper(env, demo=demo, register=True, reward="progress")
-        envs = VecFrameStack(DummyVecEnv([lambda: Monitor(env)]), 2)
+        times: Any = env.unwrapped
+        demo.save(at := str(Path(folder) / "demo.hdf5"))
+        for wrapper, arguments in settings.wrappers(at):
+            env = wrapper(env, **arguments)
+        envs = VecFrameStack(DummyVecEnv([lambda: Monitor(env)]), settings.frame_stack)
         model = SIDES[side](
-            "CnnPolicy",
+            settings.policy,
             envs,
             demo=demo,
-            warmup_steps=min(round(_GUIDED * steps), _MOST_GUIDED),
-            actor_in_warmup=False,
-            bc_pretrain_steps=_PRETRAINED,
-            bc_schedule="success",
-            bc_floor=0.5,
-            keep_own_successes=True,
-            policy_kwargs={"shared_encoder": False, "q_trains_encoder": False},
             seed=seed,
+            **{**settings.hyperparams, "warmup_steps": guided},
         )
         memory = _Memory(side, steps)
         try:
@@ -118,6 +115,12 @@ def controlled(task: str, seed: int, steps: int, side: str) -> dict[str, Any]:
         "recent_success": sum(map(bool, recent)),
         "episodes": len(recent),
     }
+
+
+def _alone(*words: Any) -> dict[str, Any]:
+    """What `controlled` says, in a process of its own: its memory is nobody else's."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(controlled, *words).result()
 
 
 def planned(
@@ -159,7 +162,7 @@ def planned(
                         "steps": steps,
                         "updates": side,
                     },
-                    partial(controlled, task, seed, steps, side),
+                    partial(_alone, task, seed, steps, side),
                     steps / _HERTZ,
                 )
                 for seed in seeds
@@ -226,7 +229,8 @@ def main(
     lines = table(plan)
     said = (
         f"The rehearsal robot at {_HERTZ} Hz by the wall clock, pictures 3 ms early or late and "
-        f"1 % of them lost; default preset. MB after the first and after the last minute. "
+        f"1 % of them lost; the task's own preset, guided for at most a fifth of "
+        f"the steps. MB after the first and after the last minute. "
         f"{below(cells)}"
     )
     options = {"tasks": tasks, "seeds": seeds, "steps": steps}

@@ -50,9 +50,12 @@ def planned(
         methods: the table's that are wanted.
 
     Raises:
-        ValueError: there is no such method.
+        ValueError: there is no such method, or nothing would be learned or evaluated.
     """
     own = said()[name]
+    for option, count in (("steps", steps), ("episodes", episodes)):
+        if count is not None and count < 1:
+            raise ValueError(f"--{option} {count}: at least 1 is needed")
     for method in methods or ():
         if method not in own["methods"]:
             raise ValueError(f"--methods {method}: choose from {', '.join(own['methods'])}")
@@ -86,12 +89,14 @@ def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
         if not run.finished:
             continue
         evaluation = json.loads((run.folder / "evaluation.json").read_text())
-        reached = {f"steps to {level}": _steps_to(run, level) for level in LEVELS}
+        # what learns from the demonstration alone makes no steps
+        steps_to = (lambda *_: np.nan) if evaluation.get("frames") == 0 else _steps_to
+        reached = {f"steps to {level}": steps_to(run, level) for level in LEVELS}
         learned = {"minutes": (seconds_of(run) or np.nan) / 60, **reached}
         for method, name in ((run.method, "policy"), *run.beside):
             if name not in evaluation:
                 continue  # it was asked for, and the run has none
-            for episode, success in enumerate(evaluation[name]["successes"]):
+            for episode, success in enumerate(evaluation[name]["successes"][: run.episodes]):
                 yield {
                     "task": task_of(run.env),
                     "method": method,
@@ -199,7 +204,8 @@ def main(
     Args:
         name: of the table.
         out: folder of the runs, and of ``NAME.md``, ``NAME.tex`` and ``NAME.parquet``.
-        dry_run: print the runs and the predicted hours, and make none.
+        dry_run: print the runs, the predicted hours and the table of those that are finished, and
+            make none.
         workers: runs at a time.
         ray: address of a Ray cluster to run on; "local" starts one.
         cpus: that Ray gives to a run.
@@ -213,6 +219,8 @@ def main(
     """
     if workers < 1:
         raise ValueError(f"--workers {workers}: at least 1 is needed")
+    if (cpus, gpus, memory) != (1, 0, 0) and not ray:
+        raise ValueError("--cpus, --gpus and --memory are shares of a Ray cluster: give --ray, too")
     runs = planned(name, out, **options)
     if stale := others(runs):
         raise ValueError("; ".join(stale))
@@ -224,6 +232,8 @@ def main(
             f"{len(missing)} of {len(runs)} runs to make: about "
             f"{predicted_hours(runs, workers):.1f} hours, {workers} at a time"
         )
+        if len(missing) < len(runs):
+            print("\n".join(["", *table(runs)]))
         return
     need_parquet(name)
     failed = finish_all(runs, workers, ray, cpus, gpus, memory)

@@ -21,7 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from regil_sb3.bench.machine import describe
+from regil_sb3.files import replacing
 
 if TYPE_CHECKING:
     from regil_sb3.settings import Settings
@@ -92,13 +93,23 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Whether it is trained and evaluated, in as many episodes and as all that is asked for."""
-        try:
-            found = json.loads((self.folder / "evaluation.json").read_text())
-        except FileNotFoundError:
+        """Whether it is trained and evaluated, in as many episodes and as all that is asked for.
+
+        Raises:
+            ValueError: ``evaluation.json`` is damaged.
+        """
+        path = self.folder / "evaluation.json"
+        if not path.exists():
             return False
-        enough = len(found["policy"]["successes"]) == self.episodes
-        return enough and {*dict(self.beside).values()} <= {*found.get("asked", found)}
+        try:
+            found = json.loads(path.read_text("utf-8"))
+            episodes = len(found["policy"]["successes"])
+            asked = {*found.get("asked", found)}
+        except (ValueError, LookupError, TypeError, AttributeError):
+            raise ValueError(
+                f"{path} is no evaluation: remove it, and the run is evaluated again"
+            ) from None
+        return episodes >= self.episodes and {*dict(self.beside).values()} <= asked
 
     @property
     def command(self) -> str:
@@ -120,11 +131,18 @@ class Run:
 
 
 def _took(run: Run) -> dict[str, Any]:
+    """``seconds``, and ``machines`` in the order in which they went on with it."""
     try:
-        told = json.loads((run.folder / "took.json").read_text())
+        told = json.loads((run.folder / "took.json").read_text("utf-8"))
     except (OSError, ValueError):
         return {}
     return told if isinstance(told, dict) else {}
+
+
+def _write_took(run: Run, seconds: float, here: str) -> None:
+    where = list(dict.fromkeys([*_took(run).get("machines", ()), here]))
+    with replacing(run.folder / "took.json") as file:
+        file.write(json.dumps({"seconds": seconds, "machines": where}).encode())
 
 
 def seconds_of(run: Run) -> float | None:
@@ -135,8 +153,9 @@ def seconds_of(run: Run) -> float | None:
 
 def machines(runs: Sequence[Run]) -> list[str]:
     """What finished runs were made on: processor, versions and commit, each once."""
-    told = [_took(run).get("machine", "a machine that is not known") for run in runs]
-    return list(dict.fromkeys(where for run, where in zip(runs, told, strict=True) if run.finished))
+    told = [_took(run).get("machines", ["a machine that is not known"]) for run in runs]
+    pairs = zip(runs, told, strict=True)
+    return list(dict.fromkeys(where for run, all_of in pairs if run.finished for where in all_of))
 
 
 def others(runs: Sequence[Run]) -> list[str]:
@@ -184,7 +203,8 @@ def finish(run: Run) -> None:
     if run.finished:
         return
     run.folder.mkdir(parents=True, exist_ok=True)
-    begun, took = time.time(), seconds_of(run) or 0.0
+    begun, took, here = time.time(), seconds_of(run) or 0.0, describe(_PACKAGES)
+    _write_took(run, took, here)
     process = get_context("spawn").Process(target=_train, args=(run,))
     process.start()
     try:
@@ -195,9 +215,7 @@ def finish(run: Run) -> None:
         process.join(_GRACE)
         raise
     finally:
-        seconds = took + time.time() - begun
-        told = {"seconds": seconds, "machine": describe(_PACKAGES)}
-        (run.folder / "took.json").write_text(json.dumps(told))
+        _write_took(run, took + time.time() - begun, here)
     if process.exitcode or not run.finished:
         raise RuntimeError(f"{run.folder} ended with status {process.exitcode}: see log.txt there")
 
@@ -216,6 +234,7 @@ def _train(run: Run) -> None:
     from regil_wrappers import Demonstration
 
     from regil_sb3 import process, training
+    from regil_sb3.run_folder import locked
     from regil_sb3.settings import Settings
 
     process.keep_freed_memory()
@@ -226,7 +245,9 @@ def _train(run: Run) -> None:
     else:
         training.train(run.settings_now, Demonstration.load(run.demo), run.folder)
     only = ("policy", "best_policy", *dict(run.beside).values())
-    training.evaluate_run(run.folder, run.episodes, only=only)
+    with locked(run.folder):
+        if not run.finished:
+            training.evaluate_run(run.folder, run.episodes, only=only)
 
 
 def finish_all(
@@ -331,7 +352,10 @@ def _on_ray(
             f"Ray is not installed ({error}): pip install 'regil-sb3[bench]'"
         ) from None
     if not ray.is_initialized():
-        ray.init(address=None if address == "local" else address, log_to_driver=False)
+        try:
+            ray.init(address=address, log_to_driver=False)
+        except (ray.exceptions.RayError, RuntimeError, OSError) as error:
+            raise ValueError(f"--ray {address}: {' '.join(str(error).split())}") from None
     alive = [node for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
     nodes = [node["Resources"] for node in alive]
     if not any(all(has.get(name, 0) >= share for name, share in shares.items()) for has in nodes):
@@ -346,7 +370,12 @@ def _on_ray(
         memory=int(shares["memory"]),
         max_retries=_AGAIN,
     )(finish)
-    pending = references = [task.remote(run) for run in runs]
+    # workers have another current folder
+    roots = [(str(Path(run.root).absolute()), str(Path(run.demo).absolute())) for run in runs]
+    found = zip(runs, roots, strict=True)
+    pending = references = [
+        task.remote(replace(run, root=root, demo=demo)) for run, (root, demo) in found
+    ]
     while pending:
         _, pending = ray.wait(pending, num_returns=len(pending), timeout=_SHOWN_EVERY)
         show()

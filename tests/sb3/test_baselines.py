@@ -364,6 +364,14 @@ def test_a_comparison_changes_what_it_names_and_no_more(name):
             assert network == (own if name.startswith(BC_TRAINS) else trained)
 
 
+STATE = "regil/metaworld-drawer-close-state-v0"
+
+
+@pytest.mark.parametrize("name", [n for n in comparisons() if n != "baku"])
+def test_a_comparison_fits_a_policy_that_sees_the_state(name):
+    assert not make_settings(STATE, name).hyperparams["policy_kwargs"]
+
+
 def test_the_papers_ablations():
     made = {name: make_settings(ENV, f"ablation-{name}").hyperparams
             for name in ("bc-rl", "reg-rl", "rl", "reg-bc")}  # fmt: skip

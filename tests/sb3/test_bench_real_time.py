@@ -27,7 +27,7 @@ def test_a_line_for_each_run(tmp_path, monkeypatch, capsys):
         asked.append(words)
         return FOUND if words[3] == "beside control" else {**FOUND, "megabytes": []}
 
-    monkeypatch.setattr(real_time, "controlled", controlled)
+    monkeypatch.setattr(real_time, "_alone", controlled)
     words = ["bench", "real-time", "--tasks", "open", "--steps", "3600", "--out", str(tmp_path)]
     assert main([*words, "--dry-run"]) == 0
     assert "2 of 2 cells to measure" in capsys.readouterr().out

@@ -75,6 +75,8 @@ def test_runs_that_were_made_otherwise_are_named(runs, failed):
     changed = replace(runs[0], settings=(*TINY[:-1], "eval_episodes=3", "k=4"))
     (line,) = others([changed, runs[1]])
     assert line.startswith(f"{runs[0].folder} was made with other settings (eval_episodes, ")
+    assert replace(runs[0], episodes=2).finished  # fewer of the same
+    assert len(list(run_tables.raw([replace(runs[0], episodes=2)]))) == 2
     for more in ({"episodes": 4}, {"beside": (("replay", "guide"),)}):  # its model is there
         again = replace(runs[0], **more)
         assert not again.finished
@@ -86,20 +88,23 @@ def test_more_is_evaluated_of_a_run_that_has_learned(runs, failed, tmp_path, mon
     shutil.copytree(runs[1].folder, tmp_path / runs[1].folder.name)
     # "corrected" it does not have: its guide is never calibrated
     beside = (("replay", "guide"), ("corrected", "corrected_guide"))
-    run = replace(runs[1], root=str(tmp_path), episodes=2, beside=beside)
+    run = replace(runs[1], root=str(tmp_path), beside=beside)
     learned = (run.folder / "model.zip").read_bytes()
     assert finish_all([run]) == []
     assert run.finished
     assert (run.folder / "model.zip").read_bytes() == learned
     rows = list(run_tables.raw([run]))
-    assert [row["method"] for row in rows] == ["ReGIL"] * 2 + ["replay"] * 2
+    assert [row["method"] for row in rows] == ["ReGIL"] * 3 + ["replay"] * 3
     assert rows[0]["minutes"] > 0
-    assert np.isnan(rows[2]["minutes"])
+    assert np.isnan(rows[3]["minutes"])
     assert run_tables.table([run])[-1].endswith("| 1 | - | - | - |")
     (run.folder / "model.zip").unlink()
     assert others([run]) == []
-    (line,) = others([replace(run, episodes=3)])
+    (line,) = others([replace(run, episodes=4)])
     assert "its model is gone: remove it" in line
+    (run.folder / "evaluation.json").write_text('{"policy": 3}')
+    with pytest.raises(ValueError, match="is no evaluation: remove it"):
+        run.finished  # noqa: B018
 
 
 def test_tables_are_what_evaluations_say(tmp_path):
@@ -141,13 +146,14 @@ def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert said[-1] == "20 of 20 runs to make: about 5.0 hours, 1 at a time"
     assert any("--preset ablation-rl " in line for line in said)
     assert not list(tmp_path.iterdir())
-    negative = ["--gpus", "-1"]
-    for words in (["--methods", "magic"], ["--workers", "0"], ["--plot", "x"], negative):
+    negative = ["--gpus", "-1", "--ray", "local"]
+    wrong = (["--episodes", "0"], ["--steps", "-3"], ["--gpus", "1"], negative)
+    for words in (["--methods", "magic"], ["--workers", "0"], ["--plot", "x"], *wrong):
         assert main(["bench", "ablations", *words]) == 2
         assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_what_is_written(runs, failed, tmp_path, monkeypatch):
+def test_what_is_written(runs, failed, tmp_path, monkeypatch, capsys):
     for run in runs[:2]:  # all that a table needs of a run
         kept = tmp_path / run.folder.name
         kept.mkdir()
@@ -155,6 +161,10 @@ def test_what_is_written(runs, failed, tmp_path, monkeypatch):
             shutil.copy(run.folder / name, kept)
     kept_alone = [replace(run, root=str(tmp_path)) for run in runs[:2]]
     monkeypatch.setattr(run_tables, "planned", lambda *_, **__: kept_alone)
+    run_tables.main("ablations", dry_run=True)
+    so_far = capsys.readouterr().out
+    assert "0 of 2 runs to make" in so_far
+    assert "| ReGIL | " in so_far
     run_tables.main("ablations", out=str(tmp_path))
     rows = parquet.read_table(tmp_path / "ablations.parquet").to_pylist()
     assert len(rows) == 2 * 3
