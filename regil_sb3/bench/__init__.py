@@ -5,7 +5,8 @@
 * ``cells`` - what is kept and never measured twice; ``page`` - how tables are written;
   ``results`` - all that are kept, on one page
 * ``rewards``, ``latency``, ``memory``, ``throughput`` - measured at once
-* ``run_tables`` - tables made of many training runs, and ``runs``, which makes each run once
+* ``run_tables`` - tables made of many training runs, and ``runs``, which makes each run once;
+  ``on_ray`` - on a cluster
 * ``buffer_vs_learning``, ``trajectories`` - of runs that have ended
 * ``real_time`` - control at 30 Hz while a policy is learned
 * ``faults`` - kills, broken disks, hostile files: ``lives``, ``disk_faults``, ``hostile``

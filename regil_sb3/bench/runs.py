@@ -19,7 +19,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from regil_sb3.bench.machine import describe
+from regil_sb3.bench.on_ray import SHOWN_EVERY, Shares, call_all, connect
 from regil_sb3.files import replacing
 
 if TYPE_CHECKING:
@@ -47,9 +48,7 @@ __all__ = [
 _PACKAGES = ("gymnasium", "metaworld", "mujoco", "stable-baselines3", "torch", "regil-sb3")
 
 _SECONDS_A_STEP = 15 * 60 / 15_000  # of one core, until a run has told
-_AGAIN = 3  # times that a run that died is taken up again
 _GRACE = 60.0  # s that an interrupted run is given to save itself
-_SHOWN_EVERY = 5.0  # s
 
 
 @dataclass(frozen=True)
@@ -277,12 +276,14 @@ def finish_all(
         ValueError: no node of the cluster has a run's share.
         KeyboardInterrupt: passed on once all runs have saved themselves.
     """
-    shares = {"CPU": cpus, "GPU": gpus, "memory": memory * 2**30}
-    if min(shares.values()) < 0:
-        raise ValueError(f"a run cannot have {_as_said(shares)}: a share is 0 or more")
+    shares = Shares(cpus, gpus, memory)
+    if min(shares) < 0:
+        raise ValueError(f"a run cannot have {shares}: a share is 0 or more")
     todo = [run for run in runs if not run.finished]
     if not todo:
         return []
+    if ray:
+        connect(ray, shares)
     _record(todo)
     with tqdm(total=sum(run.steps for run in todo), unit="step", dynamic_ncols=True) as bar:
 
@@ -293,7 +294,11 @@ def finish_all(
             bar.refresh()
 
         bar.n = bar.initial = sum(_steps_done(run) for run in todo)
-        results = _on_ray(todo, ray, shares, show) if ray else _here(todo, workers, show)
+        if ray:
+            there = [_absolute(run) for run in todo]  # workers have another current folder
+            results = call_all(finish, there, shares, show)
+        else:
+            results = _here(todo, workers, show)
         return [
             f"{run.folder.name}: {error}" for run, error in zip(todo, results, strict=True) if error
         ]
@@ -307,6 +312,11 @@ def _record(runs: Sequence[Run]) -> None:
     for demo, run in tqdm(missing.items(), desc="demonstrations", disable=not missing):
         Path(demo).parent.mkdir(parents=True, exist_ok=True)
         record_expert(run.env, run.seed).save(demo)
+
+
+def _absolute(run: Run) -> Run:
+    root, demo = (str(Path(path).absolute()) for path in (run.root, run.demo))
+    return replace(run, root=root, demo=demo)
 
 
 def _steps_done(run: Run) -> int:
@@ -325,65 +335,10 @@ def _here(runs: Sequence[Run], workers: int, show: Callable[[], None]) -> list[s
     with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(finish, run) for run in runs]
         try:
-            while wait(futures, _SHOWN_EVERY).not_done:
+            while wait(futures, SHOWN_EVERY).not_done:
                 show()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
         show()
     return [str(future.exception() or "") for future in futures]
-
-
-def _as_said(shares: Mapping[str, float]) -> str:
-    cpus, gpus, memory = shares["CPU"], shares["GPU"], shares["memory"] / 2**30
-    return f"{cpus:g} CPUs, {gpus:g} GPUs and {memory:.3g} GiB"
-
-
-def _on_ray(
-    runs: Sequence[Run],
-    address: str,
-    shares: Mapping[str, float],
-    show: Callable[[], None],
-) -> list[str]:
-    try:
-        import ray
-    except ModuleNotFoundError as error:
-        raise ImportError(
-            f"Ray is not installed ({error}): pip install 'regil-sb3[bench]'"
-        ) from None
-    if not ray.is_initialized():
-        try:
-            ray.init(address=address, log_to_driver=False)
-        except (ray.exceptions.RayError, RuntimeError, OSError) as error:
-            raise ValueError(f"--ray {address}: {' '.join(str(error).split())}") from None
-    alive = [node for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
-    nodes = [node["Resources"] for node in alive]
-    if not any(all(has.get(name, 0) >= share for name, share in shares.items()) for has in nodes):
-        wanted = _as_said(shares)
-        raise ValueError(
-            f"no node of the Ray cluster has {wanted} for a run; there are: "
-            + "; ".join(_as_said({name: has.get(name, 0) for name in shares}) for has in nodes)
-        )
-    task = ray.remote(
-        num_cpus=shares["CPU"],
-        num_gpus=shares["GPU"],
-        memory=int(shares["memory"]),
-        max_retries=_AGAIN,
-    )(finish)
-    # workers have another current folder
-    roots = [(str(Path(run.root).absolute()), str(Path(run.demo).absolute())) for run in runs]
-    found = zip(runs, roots, strict=True)
-    pending = references = [
-        task.remote(replace(run, root=root, demo=demo)) for run, (root, demo) in found
-    ]
-    while pending:
-        _, pending = ray.wait(pending, num_returns=len(pending), timeout=_SHOWN_EVERY)
-        show()
-    errors = []
-    for reference in references:
-        try:
-            ray.get(reference)
-            errors.append("")
-        except ray.exceptions.RayError as error:
-            errors.append(str(error).strip().splitlines()[-1])
-    return errors

@@ -219,7 +219,7 @@ def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
     try:
         lost = cluster.add_node(**memory)
         ray.init(address=cluster.address, log_to_driver=False)
-        with pytest.raises(ValueError, match=r"no node .* 1 CPUs, 1 GPUs and 0 GiB for a run"):
+        with pytest.raises(ValueError, match=r"no node .* 1 CPUs, 1 GPUs and 0 GiB"):
             finish_all(runs, ray="auto", gpus=1)
 
         def kill() -> None:
