@@ -282,20 +282,23 @@ def test_a_second_signal_ends_a_save_that_hangs(tmp_path, monkeypatch):
 
     def hang(*_):
         hung.set()
-        time.sleep(30)
+        for _ in range(3_000):  # a signal just before a long sleep would not end it
+            time.sleep(0.01)
 
     def begin():
         monkeypatch.setattr(os, "fsync", hang)
         threading.Thread(target=interrupt_twice).start()
 
     def interrupt_twice():
-        for _ in range(2):
-            hung.wait(300)
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.2)
+        hung.wait(300)
+        os.kill(os.getpid(), signal.SIGINT)
+        while checkpoints._told is None:  # two that are pending at once are one
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
 
+    checkpoints = CheckpointCallback(tmp_path, steps=40)
     with pytest.raises(KeyboardInterrupt):
-        new_model(toy()).learn(200, [CheckpointCallback(tmp_path, steps=40), At(79, begin)])
+        new_model(toy()).learn(200, [checkpoints, At(79, begin)])
     monkeypatch.undo()
     assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 40
 
