@@ -24,8 +24,8 @@ def test_unknown_table_gets_one_line():
     with pytest.raises(
         ValueError,
         match=r"^table 'speed' is not one of rendering, retrieval, ranking, guide, success-buffer, "
-        r"sensitivity, buffer-vs-learning, trajectories, results, latency, memory, index, "
-        r"throughput, faults$",
+        r"sensitivity, buffer-vs-learning, trajectories, real-time, results, latency, memory, "
+        r"index, throughput, faults$",
     ):
         tables.main("speed")
     with pytest.raises(ValueError, match=r"^the table 'retrieval' has no option --steps$"):
