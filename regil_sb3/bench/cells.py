@@ -23,7 +23,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from regil_sb3.bench.machine import describe
+from regil_sb3.bench.machine import describe, together
 from regil_sb3.files import replacing
 
 __all__ = ["Cell", "below", "finish", "predicted_hours"]
@@ -135,6 +135,9 @@ def finish(cells: Sequence[Cell], dry_run: bool = False) -> bool:
     with tqdm(total=total, bar_format=shape, dynamic_ncols=True, disable=not missing) as bar:
         for done, cell in enumerate(missing):
             bar.set_description_str(f"{done} of {len(missing)} cells")
+            if cell.kept is not None:  # by another bench, meanwhile
+                bar.update(cell.expected)
+                continue
             begun = time.perf_counter()
             kept = {
                 "asked": dict(cell.asked),
@@ -154,7 +157,7 @@ def below(cells: Sequence[Cell]) -> str:
     kept = [kept for cell in _unique(cells) if (kept := cell.kept)]
     seeds = sorted({one["asked"]["seed"] for one in kept})
     minutes = sum(one["seconds"] for one in kept) / 60
-    machines = "; ".join(dict.fromkeys(one["machine"] for one in kept))
+    machines = together(one["machine"] for one in kept)
     return (
         f"Demonstrations of seeds {', '.join(map(str, seeds))}; {len(kept)} cells, {minutes:.1f} "
         f"minutes one after the other; {machines}"

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import psutil
 
-__all__ = ["describe"]
+__all__ = ["describe", "together"]
 
 
 def describe(packages: Sequence[str]) -> str:
@@ -32,6 +32,18 @@ def describe(packages: Sequence[str]) -> str:
         except PackageNotFoundError:
             continue
     return ", ".join([*parts, f"commit {_commit()}"])
+
+
+def together(described: Iterable[str]) -> str:
+    """Descriptions as one line: what differs by the commit alone is said once."""
+    commits: dict[str, list[str]] = {}
+    for line in dict.fromkeys(described):
+        machine, _, commit = line.partition(", commit ")
+        commits.setdefault(machine, []).append(commit)
+    return "; ".join(
+        f"{machine}, commit {', '.join(of)}" if any(of) else machine
+        for machine, of in commits.items()
+    )
 
 
 def _processor() -> str:

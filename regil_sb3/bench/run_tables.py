@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from regil_sb3.bench.machine import together
 from regil_sb3.bench.page import need_parquet, said, write, write_rows
 from regil_sb3.bench.replay import env_id, task_of
 from regil_sb3.bench.runs import Run, finish_all, machines, others, predicted_hours, seconds_of
@@ -244,7 +245,7 @@ def main(
         hours = sum(seconds_of(run) or 0 for run in runs if run.finished) / 3600
         below = (
             f"{_paper_reached(rows)}Seeds {seeds}; {hours:.1f} hours, one run after the other; "
-            f"{'; '.join(machines(runs))}"
+            f"{together(machines(runs))}"
         )
         folder = Path(out)
         write(folder, name, options, lines, below)

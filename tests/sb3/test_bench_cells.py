@@ -9,6 +9,7 @@ from regil_wrappers.encoders.weights import MissingWeightsError
 
 from regil_sb3.bench import cells, replay, sensitivity, success_buffer
 from regil_sb3.bench.cells import Cell, below, finish, predicted_hours
+from regil_sb3.bench.machine import together
 from regil_sb3.cli import main
 from regil_sb3.intervals import wilson
 
@@ -44,6 +45,23 @@ def test_a_killed_bench_goes_on_and_nothing_is_measured_twice(tmp_path, capsys):
     assert finish(planned, dry_run=True)
     assert "Demonstrations of seeds 1, 2, 3; 3 cells, " in below(planned)
     assert "commit " in below(planned)
+
+
+def test_what_another_bench_measured_meanwhile_is_taken(tmp_path):
+    calls = []
+    twice = cell(tmp_path, 2, calls)
+
+    def measure():
+        finish([twice])
+        return {"doubled": 2}
+
+    assert finish([Cell(tmp_path, {"seed": 1}, measure, 1.0), cell(tmp_path, 2, calls)])
+    assert calls == [2]
+
+
+def test_machines_are_named_once_with_their_commits():
+    told = ["A, 2 cores, commit 1", "B", "A, 2 cores, commit 2+", "A, 2 cores, commit 1"]
+    assert together(told) == "A, 2 cores, commit 1, 2+; B"
 
 
 def test_a_cell_is_what_decides_its_result(tmp_path, monkeypatch):
