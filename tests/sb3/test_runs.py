@@ -207,7 +207,7 @@ def test_a_bench_that_was_killed_goes_on(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1_200)  # Ray's workers take long to start on busy cores
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Ray 2.40's own logs
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Ray 2.40's logs
 def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
     """Two nodes of a Ray cluster on this machine; one is killed when both have a run under way."""
     import ray
