@@ -235,7 +235,8 @@ def test_rewards_of_recorded_episodes_are_pots_transport(demo, reward):
             *_, terminated, truncated, info = env.step(rng.uniform(-0.3, 1, 2).astype(np.float32))
             seen.append(env.retriever.embedding)
             over = terminated or truncated
-        costs = cosine_costs(np.stack(seen), memory)
+        mean = memory.mean(axis=0)
+        costs = cosine_costs(np.stack(seen) - mean, memory - mean)
         t, n = costs.shape
         if reward == "tot":
             costs = context_costs(costs, 3)

@@ -113,8 +113,9 @@ def orca_step(
     Args:
         coverage: (N,) float64, ln G of the frame before; None for an episode's first.
         distances: (N,) float64, C_i: of the current frame to each of the demonstration.
-        tau: temperature, > 0, in the unit of the distances. The wrapper's is `demonstration_tau`:
-            a frame as far off as the demonstration moves in 5 frames counts exp(-1).
+        tau: temperature, > 0, in the unit of the distances. The wrapper's is N `demonstration_tau`,
+            so that a demonstration of any length, followed as far off as it moves in 5 frames,
+            comes to exp(-1).
 
     Returns:
         (N,) float64, ln G of this frame, not rising with j.
@@ -207,6 +208,9 @@ def ot_rewards(
 ) -> NDArray[np.float64]:
     """r_i = -sum_j mu_ij C_ij with cosine costs and `transport_plan`; times `episode_scale`.
 
+    C_ij = 1 - cos(x_i - m, y_j - m) with m the demonstration's mean. What all frames share, most of
+    a picture, would leave costs far below the plan's entropy, and a plan that is nearly uniform.
+
     ROT: Haldar et al., Watch and Match: Supercharging Imitation with Regularized Optimal
     Transport, CoRL 2022.
 
@@ -217,7 +221,7 @@ def ot_rewards(
     Returns:
         (T,) float64, <= 0: of each frame.
     """
-    costs = cosine_costs(episode, demonstration)
+    costs = _centred_costs(episode, demonstration)
     rewards: NDArray[np.float64] = 0.0 - (transport_plan(costs) * costs).sum(axis=1)
     return rewards
 
@@ -230,6 +234,8 @@ def tot_rewards(
 ) -> NDArray[np.float64]:
     """r_i = -sum_j mu_ij C_ij with `context_costs` and transport within `band`.
 
+    Embeddings are centred as in `ot_rewards`.
+
     TOT: Fu et al., Robot Policy Learning with Temporal Optimal Transport Reward, NeurIPS 2024.
 
     Args:
@@ -241,10 +247,17 @@ def tot_rewards(
     Returns:
         (T,) float64, <= 0: of each frame; times `episode_scale`, as for `ot_rewards`.
     """
-    costs = context_costs(cosine_costs(episode, demonstration), context)
+    costs = context_costs(_centred_costs(episode, demonstration), context)
     plan = transport_plan(costs, allowed=band(len(episode), len(demonstration), width))
     rewards: NDArray[np.float64] = 0.0 - (plan * costs).sum(axis=1)
     return rewards
+
+
+def _centred_costs(
+    episode: NDArray[np.float32], demonstration: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    mean = demonstration.mean(axis=0, dtype=np.float64)
+    return cosine_costs(episode - mean, demonstration - mean)
 
 
 def episode_scale(rewards: NDArray[np.float64]) -> float:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 __all__ = ["band", "context_costs", "cosine_costs", "transport_plan"]
 
 
-def cosine_costs(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float64]:
+def cosine_costs(x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.float64]:
     """C_ij = 1 - cos(x_i, y_j), in [0, 2]; 1 where either is zero.
 
     Args:
-        x: (T, D) float32, an episode.
-        y: (N, D) float32, a demonstration.
+        x: (T, D) float, an episode.
+        y: (N, D) float, a demonstration.
 
     Returns:
         (T, N) float64.
