@@ -42,7 +42,8 @@ def connect(address: str, shares: Shares) -> None:
     """Connect this process, unless it is.
 
     Args:
-        address: of the cluster's head; "auto": the one that runs here; "local" starts one.
+        address: of the cluster's head; "auto": the one that runs here, else one is started;
+            "local" starts one.
         shares: a task's.
 
     Raises:
@@ -57,7 +58,7 @@ def connect(address: str, shares: Shares) -> None:
         ) from None
     if not ray.is_initialized():
         try:
-            ray.init(address=address, log_to_driver=False)
+            ray.init(address=None if address == "auto" else address, log_to_driver=False)
         except (ray.exceptions.RayError, RuntimeError, OSError) as error:
             raise ValueError(f"--ray {address}: {' '.join(str(error).split())}") from None
     alive = [node for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]

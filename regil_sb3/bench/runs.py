@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -198,10 +198,12 @@ def finish(run: Run) -> None:
 
     Raises:
         RuntimeError: it could not be done; ``log.txt`` in the run's folder says why.
+        ValueError: another process is at it, and goes on.
     """
     if run.finished:
         return
     run.folder.mkdir(parents=True, exist_ok=True)
+    _wait_for_others(run)
     begun, took, here = time.time(), seconds_of(run) or 0.0, describe(_PACKAGES)
     _write_took(run, took, here)
     process = get_context("spawn").Process(target=_train, args=(run,))
@@ -219,8 +221,24 @@ def finish(run: Run) -> None:
         raise RuntimeError(f"{run.folder} ended with status {process.exitcode}: see log.txt there")
 
 
+def _wait_for_others(run: Run) -> None:
+    """Another process may still save it: its worker was lost, and this is the second one."""
+    from regil_sb3.run_folder import locked
+
+    end = time.monotonic() + _GRACE
+    while True:
+        try:
+            with locked(run.folder):
+                return
+        except ValueError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(1.0)
+
+
 def _train(run: Run) -> None:
     """In a process of its own, whose output is the run's ``log.txt``."""
+    os.setsid()  # Ctrl-C is for whoever waits for it, and passed on once
     if sys.platform == "linux":  # a run saves itself and ends where whoever waits for it is gone
         import ctypes
 
@@ -339,6 +357,13 @@ def _here(runs: Sequence[Run], workers: int, show: Callable[[], None]) -> list[s
                 show()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            begun = [future for future in futures if not future.cancelled()]
+            told: set[int | None] = set()
+            while wait(begun, 0.2).not_done:  # they save themselves
+                for child in active_children():
+                    if child.pid is not None and child.pid not in told:
+                        os.kill(child.pid, signal.SIGINT)
+                        told.add(child.pid)
             raise
         show()
     return [str(future.exception() or "") for future in futures]

@@ -19,8 +19,10 @@ import pytest
 from toy import demonstration
 
 from regil_sb3.bench import run_tables
+from regil_sb3.bench import runs as runs_module
 from regil_sb3.bench.runs import Run, finish_all, machines, others, predicted_hours, seconds_of
 from regil_sb3.cli import main
+from regil_sb3.run_folder import has_checkpoint, locked
 
 TINY = (
     "warmup_steps=60",
@@ -179,6 +181,48 @@ def test_what_is_written(runs, failed, tmp_path, monkeypatch, capsys):
     assert (tmp_path / "ablations.tex").read_text().count(r"\\") == 2
 
 
+def test_a_run_that_another_process_still_saves_is_waited_for(runs, failed, monkeypatch):
+    monkeypatch.setattr(runs_module, "_GRACE", 0.3)
+    monkeypatch.setattr(runs_module.time, "sleep", lambda _: None)
+    with locked(runs[2].folder):
+        began = time.monotonic()
+        (error,) = finish_all([runs[2]])
+        assert "is learning in" in error
+        assert time.monotonic() - began > 0.3
+    (error,) = finish_all([runs[2]])
+    assert "see log.txt there" in error
+
+
+_INTERRUPTED = """
+import signal
+from pathlib import Path
+from test_runs import toy_run
+from regil_sb3.bench.runs import finish_all
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if __name__ == "__main__":
+    runs = [toy_run(Path({!r}), seed=seed, steps=100_000) for seed in range(3)]
+    finish_all(runs, workers=2)
+"""
+
+
+def test_an_interrupted_bench_lets_its_runs_save_themselves(tmp_path):
+    script = tmp_path / "bench.py"
+    script.write_text(_INTERRUPTED.format(str(tmp_path)))
+    path = os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")])
+    bench = subprocess.Popen([sys.executable, script], env=os.environ | {"PYTHONPATH": path})
+    folders = [toy_run(tmp_path, seed=seed, steps=100_000).folder for seed in range(3)]
+    while not all((folder / "progress.csv").exists() for folder in folders[:2]):
+        assert bench.poll() is None
+        time.sleep(0.1)
+    bench.send_signal(signal.SIGINT)  # it alone, as a scheduler does
+    assert bench.wait(60) != 0
+    for folder in folders[:2]:
+        assert has_checkpoint(folder)
+        with locked(folder):  # nobody goes on with it
+            pass
+    assert not folders[2].exists()
+
+
 _BENCH = """
 from pathlib import Path
 from test_runs import toy_run
@@ -233,8 +277,10 @@ def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
         assert finish_all(runs, ray="auto", memory=0.5) == []
         killer.join()
         assert all(run.finished for run in runs)
-        policies = [(run.folder / "log.txt").read_text().count("evaluating policy") for run in runs]
-        assert all(policies)
+        begun = [
+            (run.folder / "log.txt").read_text().count("evaluating policy:   0%") for run in runs
+        ]
+        assert begun == [1, 1, 1]  # none twice
     finally:
         ray.shutdown()
         cluster.shutdown()
