@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -148,11 +149,24 @@ class Experiment(ExperimentManager):
         if isinstance(model, TD3BC):
             folder = Path(self.trained_agent).parent
             load_calibration(env, folder / "calibration.json")
-            for name, buffer in _buffers(model).items():
+            kept = _buffers(model)
+            for name, buffer in kept.items():
                 if (folder / name).exists():
                     with np.load(folder / name, allow_pickle=False) as state:
                         buffer.load_state(dict(state))
+            rl_zoo3s = [] if "replay_buffer.npz" in kept else ["replay_buffer.pkl"]
+            _say_what_is_missing(folder, [*kept, *rl_zoo3s])
         return model
+
+
+def _say_what_is_missing(folder: Path, needed: Iterable[str]) -> None:
+    """Name the buffers that a run did not save, on stderr."""
+    if missing := [name for name in needed if not (folder / name).exists()]:
+        print(
+            f"regil_sb3.zoo: {folder} has no {' and no '.join(missing)}: learning goes on from "
+            "empty buffers, with no second warm-up; train with --save-replay-buffer to keep them",
+            file=sys.stderr,
+        )
 
 
 def _buffers(model: TD3BC) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import os
 import subprocess
 import sys
@@ -12,6 +13,9 @@ import numpy as np
 import optuna
 import pytest
 import yaml
+from matplotlib import pyplot as plt
+from stable_baselines3.common.monitor import load_results
+from toy_env import ToyReach
 
 from regil_sb3 import zoo
 from regil_sb3.arguments import check_arguments
@@ -37,6 +41,9 @@ ToyReach-v0:
 """
 
 
+PPO = "ToyReach-v0: {n_timesteps: 8, policy: MlpPolicy, n_steps: 8, batch_size: 8}"
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Where demonstrations lie that our YAML names."""
@@ -59,44 +66,95 @@ def run_of(env, number=1, algo="td3bc"):
     return Path("logs") / algo / f"{name}_{number}", name
 
 
-def test_the_stock_command_learns_with_our_yaml(folder):
+SEARCHED = {
+    *("learning_rate", "batch_size", "gamma", "tau", "gradient_steps", "policy_delay"),
+    *("bc_coef", "bc_floor", "bc_schedule", "bc_pretrain_steps", "exploration_std"),
+}
+SMALLER = {
+    "sac": ["learning_starts:10"],
+    "tqc": ["learning_starts:10", "callback:[{'regil_sb3.GuidedWarmup': {'steps': 15}}]"],
+    "td3": ["learning_starts:10"],
+    "ppo": ["n_envs:2", "n_steps:8"],
+}
+
+
+def words_of(algo):
+    """A run of our YAML in seconds, with one evaluation."""
+    return ["--algo", algo, "--env", STATE, "--conf-file", str(CONFIGS / f"{algo}.yml"), "-n", "36",
+            "--eval-freq", "30", "--eval-episodes", "1", "--env-kwargs", "max_steps:20",
+            "-f", "logs", "-params", "batch_size:8", *SMALLER[algo]]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stock(folder):
+    """Runs of `python -m rl_zoo3.train`, in one process that knows nothing of our launcher."""
+    code = (
+        "import json, runpy, sys\n"
+        "for words in json.load(sys.stdin):\n"
+        "    sys.argv = ['rl_zoo3.train', *words]\n"
+        "    runpy.run_module('rl_zoo3.train', run_name='__main__')\n"
+        "assert 'regil_sb3.zoo' not in sys.modules"
+    )
     done = subprocess.run(
-        [sys.executable, "-m", "rl_zoo3.train", "--algo", "sac", "--env", STATE,
-         "--conf-file", str(CONFIGS / "sac.yml"), "-n", "110", "--eval-freq", "60",
-         "--eval-episodes", "1", "-f", "logs", "-params", "learning_starts:50", "batch_size:8"],
+        [sys.executable, "-c", code],
+        input=json.dumps([words_of(algo) for algo in SMALLER]),
         cwd=folder,
         env=os.environ | {"PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"},
         capture_output=True,
         text=True,
         check=False,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
-    run = folder / "logs" / "sac" / f"{STATE.replace('/', '-')}_1"
+    return folder / "logs"
+
+
+@pytest.mark.parametrize("algo", SMALLER)
+def test_the_stock_command_learns_with_our_yaml(algo, stock):
+    name = STATE.replace("/", "-")
+    run = stock / algo / f"{name}_1"
+    assert (run / f"{name}.zip").stat().st_size > 0
     assert (run / "best_model.zip").stat().st_size > 0
     with np.load(run / "evaluations.npz") as evaluations:
         # our reward is never above 0, Meta-World's own never below: the wrappers are there
         assert (evaluations["results"] < 0).all()
-        assert evaluations["timesteps"].tolist() == [60]
+        assert evaluations["timesteps"].tolist() == [30]
     assert "is_success" in (run / "0.monitor.csv").read_text()
 
 
-@pytest.mark.parametrize(
-    ("algo", "smaller"),
-    [
-        ("tqc", ["learning_starts:30", "callback:[{'regil_sb3.GuidedWarmup': {'steps': 40}}]"]),
-        ("td3", ["learning_starts:30"]),
-        ("ppo", ["n_envs:2", "n_steps:16"]),
-    ],
-)
-def test_other_algorithms_learn_with_our_yaml(algo, smaller, folder, monkeypatch, tmp_path):
+@pytest.mark.parametrize("algo", SMALLER)
+def test_the_launcher_runs_other_algorithms(algo, folder, monkeypatch, tmp_path):
     monkeypatch.chdir(folder)
-    words = ["train", "--algo", algo, "--env", STATE, "--conf-file", str(CONFIGS / f"{algo}.yml")]
-    few = ["-n", "60", "--eval-freq", "-1", "-f", str(tmp_path)]
-    assert zoo.main([*words, *few, "-params", "batch_size:8", *smaller]) == 0
+    words = [*words_of(algo), "-f", str(tmp_path)]
+    assert zoo.main(["train", *words, "--eval-freq", "-1"]) == 0
     assert list(tmp_path.rglob(f"{STATE.replace('/', '-')}.zip"))
 
 
-def test_stopped_and_resumed(tiny, monkeypatch):
+@pytest.mark.parametrize(
+    ("said", "seen"),
+    [([], [False, False]), (["--eval-env-kwargs", "frozen:True"], [True, False])],
+)
+@pytest.mark.parametrize("algo", ["td3bc", "ppo"])
+def test_evaluation_environments_get_the_env_kwargs(algo, said, seen, tiny, monkeypatch):
+    common, _ = tiny
+    if algo == "ppo":
+        Path("td3bc.yml").write_text(PPO)
+    sections = yaml.safe_load(Path("td3bc.yml").read_text())
+    sections["ToyReach-v0"]["env_kwargs"] = {"frozen": False}
+    Path("td3bc.yml").write_text(yaml.safe_dump(sections))
+    made = []
+    init = ToyReach.__init__
+
+    def noted(self, *args, **kwargs):
+        made.append(kwargs["frozen"])
+        init(self, *args, **kwargs)
+
+    monkeypatch.setattr(ToyReach, "__init__", noted)
+    words = [*common, "--algo", algo, "--eval-freq", "50", "-n", "8", *said]
+    assert zoo.main(["train", *words]) == 0
+    assert made == seen  # for evaluation, for training
+
+
+def test_stopped_and_resumed(tiny, monkeypatch, capsys):
     common, names = tiny
 
     def interrupt(self):
@@ -122,6 +180,7 @@ def test_stopped_and_resumed(tiny, monkeypatch):
     monkeypatch.setattr(zoo.GoingOn, "_sample_action", watch)
     again = [*common, "--save-replay-buffer", "-n", "20", "-i", str(first / f"{name}.zip")]
     assert zoo.main(["train", *again]) == 0
+    assert "--save-replay-buffer" not in capsys.readouterr().err  # nothing is missing
     second, _ = run_of("ToyReach-v0", 2)
     assert zoo.GoingOn.load(second / f"{name}.zip").num_timesteps == 65
     assert guided == [False] * 20  # no second warm-up
@@ -144,20 +203,109 @@ def test_stopped_and_resumed(tiny, monkeypatch):
     assert next(Path("video").glob("*.mp4")).stat().st_size > 0
 
 
-@pytest.mark.filterwarnings("ignore:Argument ``multivariate``")  # rl_zoo3's; Optuna 3 warns
-def test_two_workers_on_one_storage(tiny):
+@pytest.mark.parametrize(
+    ("obs", "missing"),
+    [("pixels", "success_buffer.npz and no replay_buffer.npz"),
+     ("state", "success_buffer.npz and no replay_buffer.pkl")],
+)  # fmt: skip
+def test_going_on_without_buffers_is_said(obs, missing, tiny, capsys):
     common, _ = tiny
-    search = ["-optimize", "--n-trials", "1", "--n-evaluations", "2", "--eval-episodes", "1",
-              "--storage", "logs/study.log", "--study-name", "toy", "--no-optim-plots",
-              "--optimization-log-path", "trials",
-              "-params", "warmup_steps:1000"]  # fmt: skip
-    for seed in ("1", "2"):
-        assert zoo.main(["train", *common, *search, "-n", "30", "--seed", seed]) == 0
+    if obs == "state":
+        words = ["record", "ToyReach-v0", "-o", "state.hdf5", "--env-kwargs", "obs=state"]
+        assert regil(words) == 0
+        section = yaml.safe_load(Path("td3bc.yml").read_text())["ToyReach-v0"]
+        del section["frame_stack"]
+        seen = {"demo": "state.hdf5", "image": "render"}
+        wrappers = [{name: seen for name in wrapper} for wrapper in section["env_wrapper"]]
+        section |= {"policy": "MlpPolicy", "demo": "state.hdf5", "env_wrapper": wrappers}
+        section["env_kwargs"] = {"obs": "state", "render_mode": "rgb_array"}
+        Path("td3bc.yml").write_text(yaml.safe_dump({"ToyReach-v0": section}))
+    assert zoo.main(["train", *common, "-n", "35"]) == 0
+    run, name = run_of("ToyReach-v0")
+    capsys.readouterr()
+    assert zoo.main(["train", *common, "-n", "5", "-i", str(run / f"{name}.zip")]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"regil_sb3.zoo: {run} has no {missing}: ")
+    assert "--save-replay-buffer" in line
+
+
+def curves_of(figure):
+    return plt.figure(figure).axes[0].lines
+
+
+def test_plots_of_runs(tiny, monkeypatch):
+    common, _ = tiny
+    few = ["-n", "65", "--eval-freq", "30", "--eval-episodes", "2"]
+    assert all(zoo.main(["train", *common, *few, "--seed", seed]) == 0 for seed in ("1", "2"))
+    runs = [run_of("ToyReach-v0", number)[0] for number in (1, 2)]
+    monkeypatch.setattr(plt, "show", lambda: None)
+    of = ["-e", "ToyReach-v0", "-f", "logs"]
+    try:
+        assert zoo.main(["plot", "-a", "td3bc", *of, "-y", "success", "-w", "1"]) == 0
+        assert [curve.get_ydata().tolist() for curve in curves_of("Training Success Rate")] == [
+            load_results(run)["is_success"].tolist() for run in runs
+        ]
+        assert zoo.main(["all_plots", "-a", "td3bc", *of, "-o", "results", "--no-display"]) == 0
+        plt.close("all")
+        assert zoo.main(["plot_from_file", "-i", "results"]) == 0
+        (curve,) = curves_of("Results ToyReach-v0")
+        results = [np.load(run / "evaluations.npz")["results"] for run in runs]
+        assert curve.get_ydata() == pytest.approx(np.mean(results, axis=(0, 2)))
+    finally:
+        plt.close("all")
+
+
+WORKER = """
+import os, time
+from pathlib import Path
+import gymnasium as gym
+import toy_env
+
+class Meeting(toy_env.ToyReach):
+    def step(self, action):  # as a trial does: it waits until the other worker is in one, too
+        Path("met").mkdir(exist_ok=True)
+        Path(f"met/{os.getpid()}").touch()
+        while len(list(Path("met").iterdir())) < 2:
+            time.sleep(0.02)
+        return super().step(action)
+
+gym.register("Meeting-v0", entry_point=Meeting)
+"""
+
+
+def test_two_workers_on_one_storage(tiny):
+    """Two processes, each with a trial open while the other has one."""
+    Path("worker.py").write_text(WORKER)
+    Path("td3bc.yml").write_text(Path("td3bc.yml").read_text().replace("ToyReach", "Meeting"))
+    words = ["train", "--algo", "td3bc", "--env", "Meeting-v0", "--gym-packages", "worker",
+             "--conf-file", "td3bc.yml", "--eval-freq", "-1", "-f", "logs", "-n", "30",
+             "-optimize", "--n-trials", "1", "--n-evaluations", "2", "--eval-episodes", "1",
+             "--storage", "logs/study.log", "--study-name", "toy", "--no-optim-plots",
+             "--optimization-log-path", "trials", "-params", "warmup_steps:1000"]  # fmt: skip
+    paths = [os.getcwd(), ROOT / "tests/wrappers", os.environ.get("PYTHONPATH", "")]
+    workers = [
+        subprocess.Popen(
+            [sys.executable, "-m", "regil_sb3.zoo", *words, "--seed", seed],
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for seed in ("1", "2")
+    ]
+    try:
+        for worker in workers:
+            _, error = worker.communicate(timeout=200)
+            assert worker.returncode == 0, error
+    finally:
+        for worker in workers:
+            worker.kill()
     storage = optuna.storages.JournalStorage(
         optuna.storages.journal.JournalFileBackend("logs/study.log")
     )
     trials = optuna.load_study(study_name="toy", storage=storage).trials
     assert len(trials) == 2
+    assert max(t.datetime_start for t in trials) < min(t.datetime_complete for t in trials)
     for trial in trials:
         assert trial.state == optuna.trial.TrialState.COMPLETE
         assert trial.value <= 0  # our reward, and not the environment's own
@@ -166,13 +314,14 @@ def test_two_workers_on_one_storage(tiny):
 
 
 def test_the_search_space_fits_td3bc():
+    """What makes a task easier or a run longer is not in it: demo, wrappers, warm-up, steps."""
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     defaults = {n: p.default for n, p in inspect.signature(zoo.TD3BC).parameters.items()}
     for _ in range(50):
         trial = study.ask()
         sampled = zoo.sample_td3bc(trial, 4, 1, {})
         assert zoo.convert_td3bc(trial.params) == sampled
-        assert sampled.keys() <= defaults.keys()
+        assert sampled.keys() == SEARCHED
         check_arguments(defaults | sampled)
 
 
