@@ -1,5 +1,6 @@
 """Several runs on one page: which are of one method, and how sure the difference is."""
 
+import itertools
 import math
 import re
 
@@ -7,6 +8,7 @@ import made_run
 import numpy as np
 import pytest
 import yaml
+from scipy import stats
 
 from regil_sb3.cli import main
 from regil_sb3.intervals import improvement, iqm, wilson
@@ -18,6 +20,12 @@ OTHER = "regil/metaworld-hammer-v0"
 # What rliable 1.2.0 says of these: value, low, high (50,000 resamples)
 RLIABLE = {"a": (0.6, 0.35, 0.85), "b": (0.35, 0.2, 0.5)}
 SCORES = {"a": [[0.2, 0.5, 0.9], [0.4, 0.6, 1.0]], "b": [[0.1, 0.4, 0.3], [0.5, 0.2, 0.7]]}
+# And of these its probability of improvement, a over b: the second pair has ties (20,000 resamples)
+TIES = {
+    "a": [[0.2, 0.5, 0.9, 0.5], [0.4, 0.6, 1.0, 0.6]],
+    "b": [[0.5, 0.4, 0.3, 0.9], [0.5, 0.6, 0.7, 0.4]],
+}
+RLIABLE_IMPROVEMENT = [(SCORES, (0.7222, 0.3889, 1.0)), (TIES, (0.5625, 0.2656, 0.8438))]
 
 
 @pytest.fixture
@@ -109,6 +117,69 @@ def test_iqm_is_rliables():
         found = iqm(SCORES[name])
         assert found.value == pytest.approx(value, abs=1e-9)
         assert (found.low, found.high) == pytest.approx((low, high), abs=0.02)
+
+
+@pytest.mark.parametrize(("scores", "expected"), RLIABLE_IMPROVEMENT)
+def test_improvement_is_rliables(scores, expected):
+    found = improvement(scores["a"], scores["b"])
+    assert found.value == pytest.approx(expected[0], abs=1e-4)
+    assert (found.low, found.high) == pytest.approx(expected[1:], abs=0.02)
+
+
+def test_improvement_is_the_mean_of_mann_whitneys_u():
+    """rliable's definition: U over the number of pairs, where a tie is half a win; tasks' mean."""
+    rng = np.random.default_rng(0)
+    tied = 0
+    for _ in range(30):
+        runs = rng.integers(1, 7, (2, 3))  # of each method on each task: tasks weigh the same
+        ours, theirs = ([rng.integers(0, 5, n) / 4 for n in of] for of in runs)
+        wins = []
+        for x, y in zip(ours, theirs, strict=True):
+            wins.append(stats.mannwhitneyu(x, y).statistic / (len(x) * len(y)))
+            tied += len(np.intersect1d(x, y))
+        assert improvement(ours, theirs).value == pytest.approx(np.mean(wins), abs=1e-12)
+    assert tied > 30
+
+
+def _resampled(task):
+    """All that drawing a task's runs again can give, each as probable as any other."""
+    return list(itertools.product(task, repeat=len(task)))
+
+
+def test_runs_are_drawn_again_within_their_task():
+    """The intervals are those of all resamples there are, counted instead of drawn."""
+    apart = [[0.1, 0.2, 0.4], [0.7, 0.8, 1.0]]
+    drawn = itertools.product(*map(_resampled, apart))
+    exact = np.percentile([np.sort([*x, *y])[1:5].mean() for x, y in drawn], [2.5, 97.5])
+    found = iqm(apart)
+    assert (found.low, found.high) == pytest.approx(exact, abs=0.02)
+    # Drawn from both tasks at once, it would be wider
+    pooled = np.random.default_rng(0).choice(np.ravel(apart), (5_000, 6))
+    low, high = np.percentile(np.sort(pooled)[:, 1:5].mean(axis=1), [2.5, 97.5])
+    assert low < found.low - 0.1
+    assert found.high + 0.1 < high
+
+    a, b = SCORES["a"], SCORES["b"]
+    of_tasks = [
+        [
+            np.mean([(x > y) + (x == y) / 2 for x in xs for y in ys])
+            for xs in _resampled(a[task])
+            for ys in _resampled(b[task])
+        ]
+        for task in (0, 1)
+    ]
+    exact = np.percentile(np.add.outer(*of_tasks) / 2, [2.5, 97.5])
+    found = improvement(a, b)
+    assert (found.low, found.high) == pytest.approx(exact, abs=0.02)
+
+
+def test_what_no_resample_can_change():
+    # Tasks as far apart as can be, whose own runs agree: between tasks nothing is drawn
+    assert iqm([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]) == (0.5, 0.5, 0.5)
+    assert improvement([[0.2, 0.2], [0.9, 0.9]], [[0.1, 0.1], [0.9, 0.9]]) == (0.75, 0.75, 0.75)
+    # Both methods' runs are drawn by themselves: in pairs, equal methods would have no interval
+    same = improvement([[0.0, 1.0]], [[0.0, 1.0]])
+    assert (same.low, same.value, same.high) == (0.0, 0.5, 1.0)
 
 
 def test_intervals():
