@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats  # type: ignore[import-untyped]
 
 from regil_sb3.bench.machine import describe
-from regil_sb3.bench.page import figure, need_parquet, write, write_rows
+from regil_sb3.bench.page import figure, need_parquet, write
 from regil_sb3.bench.replay import task_of
 from regil_sb3.intervals import wilson
 from regil_sb3.report.run_contents import STEPS, RunContents, read_run, successes
@@ -207,7 +207,6 @@ def main(runs: Sequence[str] = (), out: str = "bench") -> None:
         + f"Read by {describe(('numpy', 'scipy', 'regil-sb3'))}"
     )
     folder = Path(out)
-    write(folder, name, {"runs": runs} if runs else {}, lines, below)
-    write_rows(folder / f"{name}.parquet", [vars(run) for run in found])
+    write(folder, name, {"runs": runs} if runs else {}, lines, below, [vars(r) for r in found])
     _draw(found, folder / f"{name}.png")
     print("\n".join([*lines, "", below]))

@@ -3,6 +3,7 @@
 * ``Cell`` - what is asked, and how it is found
 * ``finish`` - measures those that are not kept, or says which they are
 * ``predicted_hours``, ``below`` - how long that takes; what is to be said below a table
+* ``rows`` - what a table is made from
 
 A cell's file is named by all that decides what is found: what was asked, and the versions of
 simulators and of this project. Another commit alone measures nothing again: the file says which it
@@ -26,7 +27,7 @@ from tqdm import tqdm
 from regil_sb3.bench.machine import describe, together
 from regil_sb3.files import replacing
 
-__all__ = ["Cell", "below", "finish", "predicted_hours"]
+__all__ = ["Cell", "below", "finish", "predicted_hours", "rows"]
 
 _DECIDE = ("gymnasium", "metaworld", "mujoco", "regil-sb3", "regil-wrappers")
 _SAID = ("gymnasium", "metaworld", "mujoco", "numpy", "timm", "torch", "regil-sb3")
@@ -162,3 +163,19 @@ def below(cells: Sequence[Cell]) -> str:
         f"Demonstrations of seeds {', '.join(map(str, seeds))}; {len(kept)} cells, {minutes:.1f} "
         f"minutes one after the other; {machines}"
     )
+
+
+def rows(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """A row of each kept cell: what was asked and found, by name, seconds and machine.
+
+    What has names of its own is JSON text: the guide's arguments differ from cell to cell.
+    """
+    kept = [kept for cell in _unique(cells) if (kept := cell.kept)]
+    found = [
+        {**one["asked"], **one["found"], "seconds": one["seconds"], "machine": one["machine"]}
+        for one in kept
+    ]
+    return [
+        {name: json.dumps(v) if isinstance(v, dict) else v for name, v in row.items()}
+        for row in found
+    ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -23,6 +24,7 @@ from regil_wrappers.retrieval import step_together
 
 from regil_sb3 import process
 from regil_sb3.bench import machine
+from regil_sb3.bench.page import need_parquet, said, write
 from regil_sb3.bench.peers import LIBROSA_ON_COSTS, PEERS, Peer
 
 __all__ = ["ENCODERS", "FRAMES", "Row", "latency", "main", "table"]
@@ -286,12 +288,17 @@ def _line(row: Row) -> str:
     )
 
 
-def main(**options: Any) -> list[Row]:
+def main(out: str = "bench", **options: Any) -> list[Row]:
     """Measure and print, line by line.
 
     Args:
+        out: folder of ``latency.md``, ``.tex`` and ``.parquet``.
         **options: of `latency`.
+
+    Raises:
+        ImportError: pyarrow is not installed.
     """
+    need_parquet("latency")
     process.set_threads()
     process.keep_freed_memory()  # as regil train does
     rows: list[Row] = []
@@ -299,10 +306,17 @@ def main(**options: Any) -> list[Row]:
     for row in latency(**options):
         rows.append(row)
         print(_line(row), flush=True)
-    print(
-        f"\nMedian ms of a call, k {_K}, H {_HORIZON}, pictures of {_SIDE}x{_SIDE}. Ratio: one by "
-        "one against together; others with the whole of their distances against search and S-DTW "
-        "of 1 environment; librosa given the distances against S-DTW given the same."
+    paper = "; ".join(
+        f"{where} {total:.2f} in all, {encode:.2f} encoding and {rest:.2f} search and S-DTW"
+        for where, (total, encode, rest) in said()["paper"]["latency"].items()
     )
-    print(machine.describe((*_PACKAGES, "librosa")))
+    below = (
+        f"Median ms of a call, k {_K}, H {_HORIZON}, pictures of {_SIDE}x{_SIDE}. Ratio: one by "
+        "one against together; others with the whole of their distances against search and S-DTW "
+        "of 1 environment; librosa given the distances against S-DTW given the same. The paper's "
+        f"means, DINOv3, 1 environment, 150 steps: {paper}. "
+        f"{machine.describe((*_PACKAGES, 'librosa'))}"
+    )
+    print(f"\n{below}")
+    write(Path(out), "latency", options, table(rows), below, [vars(row) for row in rows])
     return rows

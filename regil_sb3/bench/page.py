@@ -1,13 +1,14 @@
 """What tables are asked for, and where they are written.
 
 * ``said`` - ``zoo_configs/tables.yml``
-* ``write`` - a table in Markdown and LaTeX: the command above, what it was measured on below
-* ``write_rows`` - what it was made from, as parquet
+* ``write`` - a table in Markdown and LaTeX, the command above, what it was measured on below; and
+  as parquet what it was made from
 * ``figure`` - a picture beside it
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import resources
@@ -19,7 +20,7 @@ from regil_wrappers.limits import need
 
 from regil_sb3.files import replacing
 
-__all__ = ["figure", "need_parquet", "said", "write", "write_rows"]
+__all__ = ["figure", "need_parquet", "said", "write"]
 
 
 def said() -> dict[str, Any]:
@@ -30,9 +31,15 @@ def said() -> dict[str, Any]:
 
 
 def write(
-    folder: Path, name: str, options: Mapping[str, Any], table: Sequence[str], below: str
+    folder: Path,
+    name: str,
+    options: Mapping[str, Any],
+    table: Sequence[str],
+    below: str,
+    rows: Sequence[Mapping[str, Any]],
+    called: str = "",
 ) -> None:
-    """Write ``NAME.md`` and ``NAME.tex``.
+    """Write ``NAME.md``, ``NAME.tex`` and ``NAME.parquet``.
 
     Args:
         folder: where.
@@ -40,15 +47,26 @@ def write(
         options: of the command that makes it.
         table: lines of Markdown.
         below: what stands below it.
+        rows: what it was made from, of equal keys.
+        called: the files' name; "": ``name``.
+
+    Raises:
+        ImportError: pyarrow is not installed.
     """
+    import pyarrow as pa  # type: ignore[import-untyped]
+    from pyarrow import parquet
+
+    called = called or name
     command = f"    regil bench {name}{_words(options)}"
     folder.mkdir(parents=True, exist_ok=True)
     for suffix, text in (
         ("md", "\n".join([command, "", *table, "", below, ""])),
         ("tex", _latex(table)),
     ):
-        with replacing(folder / f"{name}.{suffix}") as file:
+        with replacing(folder / f"{called}.{suffix}") as file:
             file.write(text.encode())
+    with replacing(folder / f"{called}.parquet") as file:
+        parquet.write_table(pa.Table.from_pylist(list(rows)), file)
 
 
 def need_parquet(table: str) -> None:
@@ -58,15 +76,6 @@ def need_parquet(table: str) -> None:
         ImportError: pyarrow is not installed.
     """
     need("pyarrow.parquet", "lerobot", f"regil bench {table}")
-
-
-def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of equal keys as a parquet file."""
-    import pyarrow as pa  # type: ignore[import-untyped]
-    from pyarrow import parquet
-
-    with replacing(path) as file:
-        parquet.write_table(pa.Table.from_pylist(list(rows)), file)
 
 
 @contextmanager
@@ -100,9 +109,7 @@ def _latex(lines: Sequence[str]) -> str:
     """The same table in LaTeX (booktabs)."""
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     head, body = cells[0], cells[2:]
-    rows = [
-        " & ".join(row).replace("%", r"\%").replace("_", r"\_") + r" \\" for row in [head, *body]
-    ]
+    rows = [" & ".join(map(_latex_cell, row)) + r" \\" for row in [head, *body]]
     return "\n".join(
         [
             r"\begin{tabular}{l" + "c" * (len(head) - 1) + "}",
@@ -115,3 +122,8 @@ def _latex(lines: Sequence[str]) -> str:
             "",
         ]
     )
+
+
+def _latex_cell(cell: str) -> str:
+    cell = cell.replace("%", r"\%").replace("_", r"\_").replace("±", r"$\pm$")
+    return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", cell)

@@ -27,8 +27,8 @@ from tqdm import tqdm
 import regil_sb3  # registers the environments  # noqa: F401
 from regil_sb3 import process
 from regil_sb3.background import BackgroundTD3BC
-from regil_sb3.bench.cells import Cell, below, finish
-from regil_sb3.bench.page import write
+from regil_sb3.bench.cells import Cell, below, finish, rows
+from regil_sb3.bench.page import need_parquet, write
 from regil_sb3.recording import check_seeds, record_expert
 from regil_sb3.settings import make_settings
 from regil_sb3.td3bc import TD3BC
@@ -212,7 +212,7 @@ def main(
     """Measure what is not kept, and print the table.
 
     Args:
-        out: folder of kept cells, and of ``real-time.md`` and ``.tex``.
+        out: folder of kept cells, and of ``real-time.md``, ``.tex``, ``.parquet``.
         dry_run: print the cells and the predicted hours, and measure none.
         tasks: as for `planned`.
         seeds: likewise.
@@ -220,9 +220,12 @@ def main(
 
     Raises:
         ValueError: an option cannot be measured.
+        ImportError: pyarrow is not installed.
     """
     plan = planned(out, tasks, seeds, steps)
     cells = [cell for of in plan.values() for cell in of]
+    if not dry_run:
+        need_parquet("real-time")
     finish(cells, dry_run)
     if dry_run:
         return
@@ -234,5 +237,5 @@ def main(
         f"{below(cells)}"
     )
     options = {"tasks": tasks, "seeds": seeds, "steps": steps}
-    write(Path(out), "real-time", options, lines, said)
+    write(Path(out), "real-time", options, lines, said, rows(cells))
     print("\n".join([*lines, "", said]))

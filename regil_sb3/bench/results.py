@@ -27,6 +27,7 @@ KEPT = {
     **dict.fromkeys(LEARNING, ""),
     "buffer-vs-learning": "",
     "trajectories": " --runs RUN",
+    "latency": "",
     "real-time": "",
 }
 """Tables that write ``NAME.md`` into their folder, and what their commands cannot do without."""
@@ -42,8 +43,7 @@ def main(out: str = "bench", page: str = "docs/results.md") -> None:
     Raises:
         ValueError: there is no table in the folder, one is damaged, or the page cannot be there.
     """
-    found = {name: Path(out) / f"{name}.md" for name in KEPT}
-    found = {name: path for name, path in found.items() if path.exists()}
+    found = {path.stem: path for name in KEPT for path in _written(Path(out), name)}
     if not found:
         raise ValueError(
             f"--out {out}: no table is there; make one: regil bench {next(iter(KEPT))}"
@@ -66,7 +66,8 @@ def main(out: str = "bench", page: str = "docs/results.md") -> None:
         parts.append("\n".join(["## Not measured yet", "", *lines]))
     cards, gone = [], [f"{command}: not measured yet" for command in missing]
     for name, text in texts.items():
-        drawn, lacking = _learning(Path(out), name) if name in LEARNING else ("", [])
+        learned = name.startswith(LEARNING)
+        drawn, lacking = _learning(Path(out), name) if learned else ("", [])
         cards.append(card(name, _as_html(text) + _picture(Path(out) / f"{name}.png"), "wide"))
         cards.append(drawn)
         gone += lacking
@@ -74,6 +75,13 @@ def main(out: str = "bench", page: str = "docs/results.md") -> None:
         file.write(("\n\n".join(parts) + "\n").encode())
     write_page(markdown.with_suffix(".html"), "ReGIL: results", "", "".join(cards), NOTE, gone)
     print(f"{page}: {', '.join(found)}" + (f"; {len(missing)} not there yet" if missing else ""))
+
+
+def _written(out: Path, name: str) -> list[Path]:
+    """A table's files: of its own steps, then of others (``NAME-STEPS.md``)."""
+    longer = {int(p.stem[len(name) + 1 :]): p for p in out.glob(f"{name}-[0-9]*.md")}
+    paths = [out / f"{name}.md", *(longer[steps] for steps in sorted(longer))]
+    return [path for path in paths if path.exists()]
 
 
 def _learning(out: Path, name: str) -> tuple[str, list[str]]:

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from regil_sb3.bench.machine import together
-from regil_sb3.bench.page import need_parquet, said, write, write_rows
-from regil_sb3.bench.replay import env_id, task_of
+from regil_sb3.bench.page import need_parquet, said, write
+from regil_sb3.bench.replay import check, env_id, task_of
 from regil_sb3.bench.runs import Run, finish_all, machines, others, predicted_hours, seconds_of
 from regil_sb3.intervals import Interval, iqm
 
@@ -51,12 +51,11 @@ def planned(
         methods: the table's that are wanted.
 
     Raises:
-        ValueError: there is no such method, or nothing would be learned or evaluated.
+        ValueError: there is no such task or method, or nothing would be learned or evaluated.
     """
     own = said()[name]
-    for option, count in (("steps", steps), ("episodes", episodes)):
-        if count is not None and count < 1:
-            raise ValueError(f"--{option} {count}: at least 1 is needed")
+    counts = {"steps": steps, "episodes": episodes}
+    check(tasks or (), seeds or (), **{k: n for k, n in counts.items() if n is not None})
     for method in methods or ():
         if method not in own["methods"]:
             raise ValueError(f"--methods {method}: choose from {', '.join(own['methods'])}")
@@ -130,6 +129,7 @@ def table(runs: Sequence[Run]) -> list[str]:
     rows = list(raw(runs))
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
+    names = {run.method: run.called or run.method for run in runs}  # the paper's
     paper = said()["paper"]["success"]
     lines = [
         f"| method | {' | '.join(tasks)} | IQM (95 %) | runs | steps to .8 | steps to .95 | "
@@ -142,7 +142,7 @@ def table(runs: Sequence[Run]) -> list[str]:
         for task in tasks:
             here = [row["success"] for row in own if row["task"] == task]
             cell = f"{np.mean(here):.3f}" if here else "-"
-            told = paper.get(task, {}).get(method)
+            told = paper.get(task, {}).get(names.get(method))
             cells.append(cell if told is None else f"{cell} ({told:g})")
         by_run: dict[tuple[str, int], dict[str, Any]] = {
             (row["task"], row["seed"]): row for row in own
@@ -183,6 +183,22 @@ def _paper_reached(rows: Sequence[Mapping[str, Any]]) -> str:
     return told
 
 
+def _better(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Which lines are above the first one, by task: what is compared with may win."""
+    means: dict[str, dict[str, float]] = {}
+    for method, task in dict.fromkeys((row["method"], row["task"]) for row in rows):
+        own = [row["success"] for row in rows if (row["method"], row["task"]) == (method, task)]
+        means.setdefault(method, {})[task] = float(np.mean(own))
+    first, *others = means
+    above = [
+        f"{method} on {task}"
+        for method in others
+        for task, mean in means[method].items()
+        if mean > means[first].get(task, np.inf)
+    ]
+    return f"Above {first}: {', '.join(above) or 'none'}. "
+
+
 def _interval(found: Interval) -> str:
     if np.isnan(found.low):
         return f"{found.value:.3f}"
@@ -204,7 +220,8 @@ def main(
 
     Args:
         name: of the table.
-        out: folder of the runs, and of ``NAME.md``, ``NAME.tex`` and ``NAME.parquet``.
+        out: folder of the runs, and of ``NAME.md``, ``NAME.tex`` and ``NAME.parquet``; with other
+            steps than the table's own, ``NAME-STEPS.md`` and so on.
         dry_run: print the runs, the predicted hours and the table of those that are finished, and
             make none.
         workers: runs at a time.
@@ -244,12 +261,12 @@ def main(
         seeds = ", ".join(map(str, sorted({row["seed"] for row in rows})))
         hours = sum(seconds_of(run) or 0 for run in runs if run.finished) / 3600
         below = (
-            f"{_paper_reached(rows)}Seeds {seeds}; {hours:.1f} hours, one run after the other; "
-            f"{together(machines(runs))}"
+            f"{_better(rows)}{_paper_reached(rows)}Seeds {seeds}; {hours:.1f} hours, one run after "
+            f"the other; {together(machines(runs))}"
         )
-        folder = Path(out)
-        write(folder, name, options, lines, below)
-        write_rows(folder / f"{name}.parquet", rows)
+        steps = options.get("steps")
+        called = "" if steps in (None, said()[name]["steps"]) else f"{name}-{steps}"
+        write(Path(out), name, options, lines, below, rows, called)
         print("\n".join(lines))
     if failed:
         raise ValueError(f"{len(failed)} runs failed: {'; '.join(failed)}")

@@ -16,8 +16,8 @@ from regil_wrappers import RetrievalGuideWrapper
 from regil_wrappers.encoders import make_encoder
 from regil_wrappers.encoders.weights import MissingWeightsError
 
-from regil_sb3.bench.cells import Cell, below, finish
-from regil_sb3.bench.page import said, write
+from regil_sb3.bench.cells import Cell, below, finish, rows
+from regil_sb3.bench.page import need_parquet, said, write
 from regil_sb3.bench.replay import check, demonstration, env_id, env_kwargs, guides, play, task_of
 from regil_sb3.bench.rewards import TASKS
 from regil_sb3.envs import EVALUATION_SEEDS
@@ -185,7 +185,7 @@ def main(
     """Measure what is not kept, and print the table.
 
     Args:
-        out: folder of kept cells, and of ``sensitivity.md`` and ``.tex``.
+        out: folder of kept cells, and of ``sensitivity.md``, ``.tex`` and ``.parquet``.
         dry_run: print the cells and the predicted hours, and measure none.
         tasks: as for `planned`.
         seeds: likewise.
@@ -195,6 +195,7 @@ def main(
 
     Raises:
         ValueError: an option cannot be measured.
+        ImportError: pyarrow is not installed.
     """
     plan = planned(out, tasks, seeds, episodes, encoders, each_task)
     cells = [cell for found in plan.values() if not isinstance(found, str) for cell in found]
@@ -206,6 +207,7 @@ def main(
             if isinstance(why, str):
                 print(f"{varied} {value}: {why}")
         return
+    need_parquet("sensitivity")
     finish(cells)
     lines = table(plan, each_task)
     defaults = ", ".join(f"{name} {guides()['plain'][name]}" for name in said()["sensitivity"])
@@ -217,5 +219,5 @@ def main(
     options: dict[str, Any] = {"tasks": tasks, "seeds": seeds, "episodes": episodes}
     options |= {"encoders": encoders} if encoders else {}
     options |= {"each_task": True} if each_task else {}
-    write(Path(out), "sensitivity", options, lines, spread)
+    write(Path(out), "sensitivity", options, lines, spread, rows(cells))
     print("\n".join([*lines, "", spread]))

@@ -15,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 from regil_wrappers import RetrievalGuideWrapper
 
-from regil_sb3.bench.cells import Cell, below, finish
-from regil_sb3.bench.page import said, write
+from regil_sb3.bench.cells import Cell, below, finish, rows
+from regil_sb3.bench.page import need_parquet, said, write
 from regil_sb3.bench.replay import check, demonstration, env_id, env_kwargs, guides
 from regil_sb3.bench.rewards import TASKS
 
@@ -137,7 +137,7 @@ def main(
     """Measure what is not kept, and print the table.
 
     Args:
-        out: folder of kept cells, and of ``success-buffer.md`` and ``.tex``.
+        out: folder of kept cells, and of ``success-buffer.md``, ``.tex``, ``.parquet``.
         dry_run: print the cells and the predicted hours, and measure none.
         tasks: as for `planned`.
         seeds: likewise.
@@ -145,12 +145,14 @@ def main(
 
     Raises:
         ValueError: an option cannot be measured.
+        ImportError: pyarrow is not installed.
     """
     plan = planned(out, tasks, seeds, steps)
     cells = [cell for task in tasks for i in range(len(seeds)) for cell in _of(plan, task, i)]
     if dry_run:
         finish(cells, dry_run)
         return
+    need_parquet("success-buffer")
     finish(cells)
     lines = table(plan)
     said_below = (
@@ -163,6 +165,7 @@ def main(
         {"tasks": tasks, "seeds": seeds, "steps": steps},
         lines,
         said_below,
+        rows(cells),
     )
     print("\n".join([*lines, "", said_below]))
 

@@ -202,7 +202,7 @@ _ROOMS = ("ranking", *_MODULES, "latency", "memory", "index", "throughput", "fau
 FAULTS = ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers")
 """Parts of the table "faults", and the options that count them."""
 _OPTIONS = {
-    "latency": ("encoders", "frames"),
+    "latency": ("encoders", "frames", "out"),
     "memory": ("frames", "dims", "plot"),
     "index": ("frames", "dims"),
     "faults": ("out", *FAULTS),

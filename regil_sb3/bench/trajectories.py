@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from regil_sb3.bench.buffer_vs_learning import buffer_after_warmup
 from regil_sb3.bench.machine import describe
-from regil_sb3.bench.page import figure, need_parquet, write, write_rows
+from regil_sb3.bench.page import figure, need_parquet, write
 from regil_sb3.bench.replay import check, task_of
 from regil_sb3.evaluation import EVALUATION_SEED, evaluate, policy_act
 from regil_sb3.guided import executed_actions
@@ -336,7 +336,7 @@ def main(runs: Sequence[str] = (), out: str = "bench", episodes: int = 10) -> No
         f"{minutes:.1f} minutes; {describe(packages)}"
     )
     folder = Path(out)
-    write(folder, name, {"runs": runs, "episodes": episodes}, lines, below)
-    write_rows(folder / f"{name}.parquet", list(_rows(found)))
+    options = {"runs": runs, "episodes": episodes}
+    write(folder, name, options, lines, below, list(_rows(found)))
     _draw(found, folder / f"{name}.png")
     print("\n".join([*lines, "", below]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pyarrow.parquet as parquet
 import pytest
 from regil_wrappers.encoders.weights import MissingWeightsError
 
@@ -149,6 +150,9 @@ def test_sensitivity_is_printed_beside_the_papers(tmp_path, monkeypatch, capsys,
     assert "| encoder | dinov3 | encoder 'dinov3': its weights are not here | - | 0.53 |" in lines
     assert "varied about horizon 4, k 5, encoder pixels; 10 unseen goals a line" in lines[-1]
     written = (tmp_path / "sensitivity.md").read_text()
+    rows = parquet.read_table(tmp_path / "sensitivity.parquet").to_pylist()
+    assert {row["seed"] for row in rows} == {0, 1}
+    assert all(len(row["successes"]) > 0 < row["seconds"] for row in rows)
     assert written.startswith(f"    regil {' '.join(command[:-2])}\n")
     assert lines[-1] in written
 

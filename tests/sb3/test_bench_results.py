@@ -7,15 +7,16 @@ import re
 import made_run
 import pytest
 
-from regil_sb3.bench.page import figure, write, write_rows
+from regil_sb3.bench.page import figure, write
 from regil_sb3.cli import main
 
 TABLE = ["| H | success |", "|---|---|", "| 4 | 0.50 |", "| **mean** | 0.25 < 1 |"]
+ROWS = [{"H": 4, "success": 0.5}]
 
 
 @pytest.fixture
 def bench(tmp_path):
-    write(tmp_path / "bench", "sensitivity", {"episodes": 7}, TABLE, "On a machine & more")
+    write(tmp_path / "bench", "sensitivity", {"episodes": 7}, TABLE, "On a machine & more", ROWS)
     return tmp_path / "bench"
 
 
@@ -26,7 +27,7 @@ def words(bench, page):
 def test_results_are_the_tables_that_are_kept(bench, tmp_path, capsys):
     page = tmp_path / "results.md"
     assert main(words(bench, page)) == 0
-    assert capsys.readouterr().out == f"{page}: sensitivity; 7 not there yet\n"
+    assert capsys.readouterr().out == f"{page}: sensitivity; 8 not there yet\n"
     text = page.read_text()
     table = "\n".join(TABLE)
     command = "    regil bench sensitivity --episodes 7"
@@ -53,11 +54,10 @@ def test_learning_tables_have_plots(bench, tmp_path):
             made_run.run(folder, env, seed, solved[seed], films=False)
     rows.append({**rows[0], "run": "metaworld-hammer-ReGIL-2-15000"})
     rows.append({**rows[0], "method": "guide", "evaluated": "guide"})  # has no curve
-    write_rows(bench / "ablations.parquet", rows)
-    write(bench, "ablations", {}, TABLE, "there")
+    write(bench, "ablations", {}, TABLE, "there", rows)
     with figure(bench / "trajectories.png") as ((axis,),):
         axis.plot([0, 1], [0, 1])
-    write(bench, "trajectories", {}, TABLE, "here")
+    write(bench, "trajectories", {}, TABLE, "here", ROWS)
     assert main(words(bench, tmp_path / "results.md")) == 0
     shown = (tmp_path / "results.html").read_text()
     assert shown.count('src="data:image/png;base64,') == 1
@@ -66,6 +66,23 @@ def test_learning_tables_have_plots(bench, tmp_path):
     assert re.search(r"<td>RL</td><td>0 % \(0 to 0 %\)", shown)  # none beats one of the first
     assert "<td>90 % (85 to 95, 2 runs)</td>" in shown
     assert "metaworld-hammer-ReGIL-2-15000, a run of ablations, is not there any more" in shown
+
+
+def test_a_table_of_more_steps_stands_beside_its_own(bench, tmp_path):
+    for called in ("ablations-60000", "ablations-7500", ""):
+        rows = [{"task": "hammer", "method": "RL", "run": "gone", "evaluated": "policy"}]
+        write(bench, "ablations", {}, TABLE, f"of {called}", rows, called)
+    assert main(words(bench, tmp_path / "results.md")) == 0
+    titles = re.findall(r"^## (.*)", (tmp_path / "results.md").read_text(), re.M)
+    assert titles[:4] == ["sensitivity", "ablations", "ablations-7500", "ablations-60000"]
+
+
+def test_latex_says_the_same(bench):
+    write(
+        bench, "success-buffer", {}, ["| a_b | c |", "|---|---|", "| **x** | 3 ± 1 % |"], "", ROWS
+    )
+    body = (bench / "success-buffer.tex").read_text().splitlines()[2:5]
+    assert body == [r"a\_b & c \\", r"\midrule", r"\textbf{x} & 3 $\pm$ 1 \% \\"]
 
 
 @pytest.mark.parametrize(

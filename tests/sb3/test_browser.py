@@ -42,7 +42,9 @@ def pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     runs = [made_run.run(folder / f"{i}", seed=i, solved=19 - i) for i in range(2)]
     wide = ["| " + " | ".join(["a column"] * 12) + " |"] * 3
-    write(folder, "trajectories", {"runs": ["a/long/way/" * 20]}, wide, "b/long/way/" * 20)
+    write(
+        folder, "trajectories", {"runs": ["a/long/way/" * 20]}, wide, "b/long/way/" * 20, [{"x": 1}]
+    )
     with figure(folder / "trajectories.png", columns=2):
         pass  # empty panels will do
     results.main(str(folder), str(folder / "results.md"))

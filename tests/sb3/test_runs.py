@@ -136,6 +136,14 @@ def test_tables_are_what_evaluations_say(tmp_path):
     assert len(rows := list(run_tables.raw(runs))) == 16
     assert "50,000 to 100,000 frames" in run_tables._paper_reached(rows)
     assert not run_tables._paper_reached(rows[8:])  # hammer's
+    assert run_tables._better(rows) == "Above ReGIL: none. "
+    runs[3] = done("hammer", "BC", 0, yes, None)
+    (runs[2].folder / "evaluation.json").write_text(
+        json.dumps({"policy": {"successes": [*yes[:3], False], "lengths": [9] * 4}})
+    )
+    assert run_tables._better(list(run_tables.raw(runs))) == "Above ReGIL: BC on hammer. "
+    shared = replace(runs[0], method="progress", called="ReGIL")
+    assert run_tables.table([shared])[-1].startswith("| progress | 1.000 (0.97) |")
 
 
 def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
@@ -149,7 +157,7 @@ def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert any("--preset ablation-rl " in line for line in said)
     assert not list(tmp_path.iterdir())
     negative = ["--gpus", "-1", "--ray", "local"]
-    wrong = (["--episodes", "0"], ["--steps", "-3"], ["--gpus", "1"], negative)
+    wrong = (["--episodes", "0"], ["--steps", "-3"], ["--gpus", "1"], negative, ["--tasks", "fly"])
     for words in (["--methods", "magic"], ["--workers", "0"], ["--plot", "x"], *wrong):
         assert main(["bench", "ablations", *words]) == 2
         assert capsys.readouterr().err.count("\n") == 1
@@ -179,6 +187,9 @@ def test_what_is_written(runs, failed, tmp_path, monkeypatch, capsys):
         float(text.split("| ReGIL | ")[1].split(" ")[0]), abs=1e-3
     )
     assert (tmp_path / "ablations.tex").read_text().count(r"\\") == 2
+    run_tables.main("ablations", out=str(tmp_path), steps=60_000)
+    assert "--steps 60000" in (tmp_path / "ablations-60000.md").read_text()
+    assert (tmp_path / "ablations.md").read_text() == text
 
 
 def test_a_run_that_another_process_still_saves_is_waited_for(runs, failed, monkeypatch):
