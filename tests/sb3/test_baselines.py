@@ -121,6 +121,19 @@ def test_baku_overfits_the_demonstration(corner, tmp_path, head):
     assert resumed.num_timesteps == 205
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(3_600)
+@pytest.mark.parametrize("preset", ["bc", "baku"])
+def test_the_presets_overfit_metaworlds_demonstration(tmp_path, preset):
+    """As they are shipped, from the one start that the demonstration begins at."""
+    demo = record_expert(ENV, seed=0)
+    settings = make_settings(ENV, preset, seed=0)
+    train(settings, demo, tmp_path / "run")
+    model = ALGOS[settings.algo].load(tmp_path / "run/model.zip")
+    with closing(make_env(settings, tmp_path / "run/demo.hdf5")) as env:
+        assert evaluate(policy_act(model), env, 1, demo.metadata["seed"]).successes == [True]
+
+
 def test_baku_averages_what_it_said_of_a_step():
     """Against temporal ensembling as it is defined: w_i = exp(-m i), the oldest first."""
     n, chunk, m = 2, 3, 0.5
