@@ -1,5 +1,6 @@
 """Versions in lockstep; what is built is reproducible, complete, and works by itself."""
 
+import ast
 import configparser
 import os
 import re
@@ -8,7 +9,9 @@ import sys
 import sysconfig
 import tarfile
 import zipfile
-from importlib.metadata import version
+from collections.abc import Iterator
+from email import message_from_bytes
+from importlib.metadata import distribution, requires, version
 from importlib.resources import files
 from pathlib import Path
 
@@ -19,8 +22,23 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 import regil_sb3
+from regil_sb3.bench.peers import LIBROSA_ON_COSTS, PEERS
 
 ROOT = Path(__file__).parents[2]
+
+# Import names of distributions that are not here, or here as a checkout: no list of files tells
+IMPORTED_AS = {
+    "franky-control": {"franky"},
+    "pyrealsense2": {"pyrealsense2"},
+    "regil-sb3": {"regil_sb3"},
+    "regil-wrappers": {"regil_wrappers"},
+}
+# Modules that are for one extra alone import it at once; nothing else imports them
+OF_AN_EXTRA = {"regil_sb3/zoo.py": "zoo", "regil_sb3/bench/hostile.py": "bench"}
+# Installed with --no-deps (docs/libero.md, docs/robosuite.md), so of no extra
+BY_HAND = {"libero", "robosuite"}
+# Of regil-wrappers alone: what comes with another package, and is used only together with it
+FROM = {"huggingface_hub": "timm"}
 
 pytestmark = pytest.mark.packaging
 
@@ -131,6 +149,105 @@ def test_distributions_hold_the_data_files_and_no_tests(dist):
     for path in dist.glob("regil_wrappers*"):
         assert "regil_wrappers/py.typed" in _inside(path)
         assert any(name.endswith("LICENSE") for name in _inside(path))
+
+
+def _imports(node: ast.AST, lazy: bool = False) -> Iterator[tuple[str, bool, str | None]]:
+    """Of each import: the package, whether it waits for a call, and the extra that it names."""
+    for child in ast.iter_child_nodes(node):
+        match child:
+            case ast.Import(names=names):
+                found = [(alias.name, None) for alias in names]
+            case ast.ImportFrom(module=str(module), level=0):
+                found = [(module, None)]
+            case ast.Call(
+                func=ast.Name(id="need"),
+                args=[ast.Constant(value=str(module)), ast.Constant(value=str(extra)), *_],
+            ):
+                found = [(module, extra)]
+            case ast.Call(
+                func=ast.Name(id="import_module" | "find_spec")
+                | ast.Attribute(attr="import_module" | "find_spec"),
+                args=[ast.Constant(value=str(module)), *_],
+            ):
+                found = [(module, None)]
+            case _:
+                found = []
+        for module, extra in found:
+            yield module.partition(".")[0], lazy, extra
+        waits = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) or (
+            isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING"
+        )
+        yield from _imports(child, lazy or waits)
+
+
+def _brought(wanted: dict[str, list[Requirement]], name: str, extra: str = "") -> set[str]:
+    """Import names of what a distribution asks for itself: without an extra, or by that alone."""
+    out = set()
+    for requirement in wanted[name]:
+        marker = requirement.marker
+        asks, always = (marker is None or marker.evaluate({"extra": e}) for e in (extra, ""))
+        if asks and always == (not extra):
+            asked = canonicalize_name(requirement.name)
+            if asked in wanted and requirement.extras:
+                out |= set().union(*(_brought(wanted, asked, e) for e in requirement.extras))
+            elif asked in IMPORTED_AS:
+                out |= IMPORTED_AS[asked]
+            else:
+                out |= {file.parts[0].partition(".")[0] for file in distribution(asked).files}
+    return out - {""}
+
+
+def test_what_is_imported_is_asked_for(dist):
+    """By the wheel itself, not only by what it depends on; what waits for a call, by an extra."""
+    wanted, sources = {}, {}
+    for wheel in dist.glob("*.whl"):
+        with zipfile.ZipFile(wheel) as archive:
+            inside = {name: archive.read(name) for name in archive.namelist()}
+        name = canonicalize_name(wheel.name.partition("-")[0])
+        (said,) = [text for path, text in inside.items() if path.endswith("/METADATA")]
+        lines = message_from_bytes(said).get_all("Requires-Dist")
+        wanted[name] = [Requirement(line) for line in lines]
+        sources[name] = {p: ast.parse(text) for p, text in inside.items() if p.endswith(".py")}
+
+    extras = {
+        name: {extra: _brought(wanted, name, extra) for extra in _extras(of) - {"docs", "tests"}}
+        for name, of in wanted.items()
+    }
+    wrappers, sb3 = "regil-wrappers", "regil-sb3"
+    peers = {peer.module.partition(".")[0] for peer in (*PEERS, LIBROSA_ON_COSTS)}
+    assert peers <= extras[sb3]["bench"]
+    for package, of in FROM.items():
+        assert package in {Requirement(line).name for line in requires(of)}
+    some = {name: set().union(*extras[wrappers].values()) for name in wanted}
+    some[wrappers] |= FROM.keys()
+    some[sb3] |= BY_HAND.union(*extras[sb3].values())
+    missing, tried = {}, set()
+    for name, modules in sources.items():
+        base = _brought(wanted, name) | IMPORTED_AS[name] | sys.stdlib_module_names
+        for path, module in modules.items():
+            at_once = extras[name].get(OF_AN_EXTRA.get(path, ""), set())
+            for package, lazy, extra in _imports(module):
+                also = extras[wrappers][extra] if extra else some[name] if lazy else at_once
+                if package not in base | also:
+                    missing.setdefault((name, package), path)
+                tried.add((package, lazy))
+    assert missing == {}
+    assert {("numpy", False), ("rl_zoo3", False), ("av", True), ("metaworld", True)} <= tried
+
+
+def _extras(requirements: list[Requirement]) -> set[str]:
+    return set(re.findall(r'extra == "(\w+)"', " ".join(map(str, requirements))))
+
+
+def test_what_is_for_an_extra_is_not_imported_without_it():
+    code = "import sys, regil_sb3.cli, regil_sb3.training, regil_wrappers; "
+    code += "from regil_sb3 import *; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert {"regil_sb3.td3bc", "regil_sb3.report", "regil_wrappers.wrappers"} <= loaded
+    of_extras = {path.removesuffix(".py").replace("/", ".") for path in OF_AN_EXTRA}
+    lazy = {"metaworld", "mujoco", "timm", "faiss", "av", "pyarrow", "ray", "rl_zoo3", "pygame"}
+    assert not loaded & (of_extras | lazy)
 
 
 @pytest.mark.timeout(600)
