@@ -4,7 +4,7 @@
 * ``main`` - the same as a table, a page and an exit status
 
 ``examination`` asks ``pictures``, then ``episodes`` and ``rewards``, then ``search`` (other
-encoders, k and horizon); each says ``findings``, and ``page`` shows them.
+encoders, k and horizon) and ``cost``; each says ``findings``, and ``page`` shows them.
 """
 
 from regil_sb3.doctor.examination import examine, main

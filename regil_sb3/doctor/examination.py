@@ -17,7 +17,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-import psutil
 from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper
 from regil_wrappers.encoders import embed
 from regil_wrappers.frames import FrameSource
@@ -26,6 +25,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 import regil_sb3  # registers the environments  # noqa: F401
 from regil_sb3.as_seen import as_seen
+from regil_sb3.doctor.cost import check_cost
 from regil_sb3.doctor.episodes import Act, Played, check_guide, check_replay, play
 from regil_sb3.doctor.findings import Finding, listed, status, table
 from regil_sb3.doctor.page import write_page
@@ -40,7 +40,7 @@ from regil_sb3.doctor.pictures import (
 from regil_sb3.doctor.rewards import Reward, check_reward, judged, played_demonstration, signals
 from regil_sb3.doctor.search import Filmed, candidates, search
 from regil_sb3.evaluation import SELECTION_SEED
-from regil_sb3.replay_buffer import frame_bytes
+from regil_sb3.process import keep_freed_memory
 from regil_sb3.settings import RETRIEVAL, Settings, make_settings
 from regil_sb3.td3bc import TD3BC
 
@@ -68,7 +68,7 @@ def examine(
     First what pictures and actions say; then, where the retrieval wrappers would take the
     demonstration, episodes: its actions replayed, the guide plain and corrected, a disturbed guide,
     standing still. Their seeds are those that training selects its best model on, not those of its
-    evaluation.
+    evaluation. Last a learner learns for a moment, as training lets it, for memory and time.
 
     Example:
         >>> from regil_sb3 import doctor
@@ -147,7 +147,8 @@ def _seen(
     except ValueError as error:
         return [*found, Finding("retrieval", "wrong", str(error))], None
     embedded = retriever.embeddings
-    found += check_motion(demo, embedded, own["horizon"], env.action_space)
+    gripper = _gripper(env)
+    found += check_motion(demo, embedded, own["horizon"], env.action_space, gripper)
     finding, firsts = check_pictures(env, source, [SELECTION_SEED + i for i in range(_RESETS)])
     found.append(finding)
     if not firsts:
@@ -168,6 +169,12 @@ def _observations(env: Env, demo: Demonstration) -> list[Finding]:
     except ValueError as error:
         return [Finding("observations", "warning", f"TD3BC cannot clone it: {error}")]
     return [Finding("observations", "ok", "those of a policy without camera are in it")]
+
+
+def _gripper(env: Env) -> int | None:
+    """Which dimension of an action moves the gripper, as far as the environment says."""
+    dim = said_of(env).get("gripper_dim")
+    return dim if isinstance(dim, int) else None
 
 
 class _Episodes:
@@ -219,7 +226,8 @@ class _Episodes:
                 said = f"calibration did not end in {_CALIBRATIONS} episodes"
             found.append(check_guide(plain, corrected, said))
         rewards = self._rewards(env, guided)
-        found += check_reward(rewards, self._settings.retrieval("reward"))
+        none = "nothing was replayed" if plain is None else "no replay failed"
+        found += check_reward(rewards, self._settings.retrieval("reward"), none)
         words = ""
         if self._encoders is not None:
             more, words = search(
@@ -233,7 +241,10 @@ class _Episodes:
             )
             found += more
         found.append(_recommended(rewards, plain, corrected, words))
-        found.append(_expected(self._env, self._settings, self._seconds / self._steps))
+        self._say("a learner, for a moment")
+        found += check_cost(
+            self._env, self._demo, self._settings, self._seconds / self._steps, self._limit
+        )
         return found
 
     def _arguments(self, settings: Settings, wrapper: Any) -> dict[str, Any]:
@@ -292,8 +303,8 @@ class _Episodes:
         rng = np.random.default_rng(0)
         space.seed(0)
         idle = np.clip(np.zeros(space.shape, np.float32), space.low, space.high)
-        gripper = said_of(self._env).get("gripper_dim")
-        if isinstance(gripper, int) and self._demo.actions is not None:
+        gripper = _gripper(self._env)
+        if gripper is not None and self._demo.actions is not None:
             idle[gripper] = self._demo.actions[0, gripper]
 
         def pushed(_: int) -> npt.NDArray[np.float32]:
@@ -309,10 +320,10 @@ class _Episodes:
         successes = [p for p in guided if p.success]
         successes = successes or [played_demonstration(env.retriever)]
         failures = [p for p in (*guided, *disturbed) if not p.success]
-        limit = max(p.steps for p in (*still, *failures))
+        self._limit = max(p.steps for p in (*still, *failures))
         self._groups = successes, failures, still
         return [
-            judged(name, successes, failures, still, self._gamma, limit)
+            judged(name, successes, failures, still, self._gamma, self._limit)
             for name in successes[0].rewards
         ]
 
@@ -348,27 +359,6 @@ def _recommended(
     return Finding("recommended", "ok", " ".join([*words, *([searched] if searched else [])]))
 
 
-def _expected(env: Env, settings: Settings, seconds: float) -> Finding:
-    """Memory of the replay buffer, and time of the environment's steps alone."""
-    transitions = settings.hyperparams.get("buffer_size", _default("buffer_size"))
-    space = env.observation_space
-    parts = list(space.spaces.values()) if isinstance(space, gym.spaces.Dict) else [space]
-    once = is_image_space(space)  # other observations are stored with their successors
-    needed = transitions * sum(frame_bytes(part, 1) for part in parts) * (1 if once else 2)
-    free = psutil.virtual_memory().available
-    minutes = settings.steps * seconds / 60
-    line = (
-        f"replay buffer {needed / 1e9:.2f} GB for {transitions:,} transitions, of "
-        f"{free / 1e9:.1f} GB free; a step of environment and retrieval took "
-        f"{1000 * seconds:.0f} ms now, so {settings.steps:,} steps {minutes:.0f} min, and the "
-        "updates besides"
-    )
-    if needed > free:
-        most = int(0.8 * transitions * free / needed)
-        return Finding("expected", "wrong", f"{line}: set buffer_size to at most {most}")
-    return Finding("expected", "ok", line)
-
-
 def main(
     env: str,
     demo: Path,
@@ -397,6 +387,7 @@ def main(
     """
     settings = make_settings(env, preset, overrides=list(overrides))
     read = Demonstration.load(demo)
+    keep_freed_memory()  # as training does
 
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)

@@ -49,6 +49,7 @@ _CLIPPED = 0.9  # of the steps
 _STILL = 0.1  # of a fast step (90th percentile): a step that shows less moves nothing
 _IDLE_START = 5  # frames
 _IDLE_INSIDE = 0.2  # of the frames
+_GRIPS = 15  # steps from a gripper's command until it holds; robosuite's take 13
 _APART = 0.2  # of the demonstration's way
 _ALIKE = 0.05  # of the frames
 _COMPARED = 2_000  # frames, at most, each with each
@@ -228,8 +229,19 @@ def is_idle(embedded: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     return idle
 
 
+def _grips(actions: npt.NDArray[np.float32], gripper: int) -> npt.NDArray[np.bool_]:
+    """(N - 1,) bool: the steps in which the gripper may still close or open."""
+    switched = np.flatnonzero(np.diff(np.sign(actions[:, gripper]))) + 1
+    steps = np.arange(len(actions))[:, None] - switched
+    return np.asarray(((steps >= 0) & (steps < _GRIPS)).any(axis=1), bool)
+
+
 def check_motion(
-    demo: Demonstration, embedded: npt.NDArray[np.float32], horizon: int, space: gym.Space[Any]
+    demo: Demonstration,
+    embedded: npt.NDArray[np.float32],
+    horizon: int,
+    space: gym.Space[Any],
+    gripper: int | None = None,
 ) -> list[Finding]:
     """Idle frames at the start and inside, and moments that look alike but are not near.
 
@@ -238,6 +250,7 @@ def check_motion(
         embedded: (N, D) float32, of its frames.
         horizon: H: so many frames before are compared too, as in retrieval.
         space: of actions.
+        gripper: the dimension that moves it: while it closes or opens, waiting is no idleness.
     """
     steps = _steps(embedded)
     if not steps.any():
@@ -249,6 +262,11 @@ def check_motion(
     inside = int(idle.sum()) - start - end
     n = len(embedded)
     where = f"{start} at the start, {inside} inside, {end} at the end, of {n}"
+    if gripper is not None and demo.actions is not None and demo.actions.shape[1:] == space.shape:
+        within = slice(start, len(idle) - end)
+        gripped = int((idle & _grips(demo.actions[: n - 1], gripper))[within].sum())
+        inside -= gripped  # it has to wait then
+        where += f" ({gripped} of them while the gripper moves)" if gripped else ""
     if start >= _IDLE_START:
         line = (
             f"{where}: nothing moves in the first {start} steps, which teach to stand still: "

@@ -2,7 +2,8 @@
 
 * ``signals`` - every reward that is known at each step
 * ``played_demonstration`` - the demonstration itself as an episode
-* ``Reward``, ``judged`` - how one reward ranks episodes
+* ``Worth`` - what one reward gives some episodes
+* ``Reward``, ``judged`` - how it ranks successes, failures and standing still
 * ``check_reward`` - the same as findings
 """
 
@@ -19,7 +20,7 @@ from regil_wrappers.reward_signals import AT_EVERY_STEP, Signal, make_signal
 from regil_sb3.doctor.episodes import Played
 from regil_sb3.doctor.findings import Finding, Verdict
 
-__all__ = ["Reward", "check_reward", "judged", "played_demonstration", "signals"]
+__all__ = ["Reward", "Worth", "check_reward", "judged", "played_demonstration", "signals"]
 
 _FREEZES = 0.1  # of the moments: a reward by which freezing pays more often is warned of
 
@@ -54,11 +55,31 @@ def played_demonstration(retriever: Retriever) -> Played:
 
 
 @dataclass(frozen=True)
+class Worth:
+    """What one reward gives some episodes.
+
+    Attributes:
+        value: their discounted return, mean.
+        step: the reward of a step, mean over all of them.
+    """
+
+    value: float
+    step: float
+
+    def __str__(self) -> str:
+        value = f"{self.value:.0f}" if abs(self.value) >= 100 else f"{self.value:.3g}"
+        return f"{value} ({self.step:.2g} a step)"
+
+
+@dataclass(frozen=True)
 class Reward:
     """How one reward ranks what was played, as shares in [0, 1] unless said otherwise.
 
     Attributes:
         name: of the reward.
+        success: what successes are worth.
+        failure: what failures are worth; None where nothing failed.
+        still: what standing still is worth.
         above_still: of successes with a return above standing still from the same start.
         above_failure: of pairs of a success and a failure in which the success's return is higher;
             NaN where nothing failed.
@@ -68,6 +89,9 @@ class Reward:
     """
 
     name: str
+    success: Worth
+    failure: Worth | None
+    still: Worth
     above_still: float
     above_failure: float
     order: float
@@ -116,11 +140,19 @@ def judged(
             freezes.append(value(rewards[t + 1 :]) < freezing)
     return Reward(
         name,
+        _worth(name, successes, good),
+        _worth(name, failures, bad) if bad else None,
+        _worth(name, still, idle),
         float(np.mean([g > i for g in good for i in idle])),
         float(np.mean(pairs)) if pairs else float("nan"),
         float(np.mean(orders)),
         float(np.mean(freezes)) if freezes else 0.0,
     )
+
+
+def _worth(name: str, played: Sequence[Played], values: Sequence[float]) -> Worth:
+    steps = np.concatenate([p.rewards[name] for p in played])
+    return Worth(float(np.mean(values)), float(np.mean(steps)))
 
 
 def _spearman(values: npt.NDArray[np.float64]) -> float:
@@ -132,19 +164,24 @@ def _spearman(values: npt.NDArray[np.float64]) -> float:
     return float(np.corrcoef(ranks, np.arange(len(values)))[0, 1])
 
 
-def check_reward(rewards: Sequence[Reward], trained: str) -> list[Finding]:
+def check_reward(
+    rewards: Sequence[Reward], trained: str, none: str = "no replay failed"
+) -> list[Finding]:
     """One line for each reward; the one that the settings name is warned of where it misleads.
 
     Args:
         rewards: of `judged`.
         trained: the one that the settings name.
+        none: what to say of failure where there is none.
     """
     best = max(rewards, key=lambda reward: reward.rank).name
     found = []
     for r in rewards:
-        failure = "" if np.isnan(r.above_failure) else f", above failure {r.above_failure:.0%}"
+        failure = none if r.failure is None else f"failure {r.failure}"
+        above = "" if r.failure is None else f", above failure {r.above_failure:.0%}"
         line = (
-            f"success above standing still {r.above_still:.0%}{failure}, order {r.order:+.2f}, "
+            f"success is worth {r.success}, {failure}, standing still {r.still}; success above "
+            f"standing still {r.above_still:.0%}{above}, order {r.order:+.2f}, "
             f"freezing beats finishing in {r.freezing:.0%} of the moments"
         )
         misleads = r.above_still < 1 or r.freezing > _FREEZES

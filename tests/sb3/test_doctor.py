@@ -16,7 +16,7 @@ from regil_sb3.cli import main
 from regil_sb3.doctor.episodes import Played, check_guide
 from regil_sb3.doctor.findings import Finding, status, table
 from regil_sb3.doctor.pictures import check_actions, check_motion, check_recorded
-from regil_sb3.doctor.rewards import Reward, check_reward, judged
+from regil_sb3.doctor.rewards import Reward, Worth, check_reward, judged
 from regil_sb3.settings import make_settings
 
 ENV = "ToyCamera-v0"
@@ -74,6 +74,13 @@ def test_the_right_demonstration(right):
     rewards = {f.check for f in found if f.check.startswith("reward")}
     assert rewards == {f"reward {r}" for r in ("sdtw", "progress", "cos", "orca", "pwil")}
     assert "would mislead" in line(found, "reward cos")
+    assert re.match(
+        r"success is worth -[\d.]+ \(-[\d.]+ a step\), (no replay failed|failure -.*), "
+        r"standing still -[\d.]+ \(-[\d.]+ a step\); ",
+        line(found, "reward progress"),
+    )
+    assert "learner" in line(found, "time")
+    assert "replay buffer" in line(found, "memory")
     assert "corrected guide, episode 3 of 3" in said
 
 
@@ -185,6 +192,22 @@ def test_idle_frames_inside_and_none(demo):
     assert finding.verdict == "wrong"
 
 
+@pytest.mark.parametrize(
+    ("waits", "closes", "verdict", "excused"),
+    [(12, True, "ok", 12), (12, False, "warning", 0), (40, True, "warning", 15)],
+)
+def test_waiting_for_the_gripper_is_not_idle(demo, waits, closes, verdict, excused):
+    middle = len(demo.frames) // 2
+    order = [*range(middle), *[middle] * waits, *range(middle, len(demo.frames))]
+    actions = np.full((len(order) - 1, 4), -1, np.float32)
+    actions[middle:, 3] = 1 if closes else -1
+    grips = changed(demo, frames=demo.frames[order], actions=actions, successes=None)
+    motion, _ = check_motion(grips, embedded(grips), 4, SPACE, gripper=3)
+    assert motion.verdict == verdict
+    assert f"{waits} inside, 0 at the end" in motion.line
+    assert (f"({excused} of them while the gripper moves)" in motion.line) == closes
+
+
 def test_ambiguous_frames(demo):
     # There and back and there again: the way there looks the same both times
     n = len(demo.frames)
@@ -237,6 +260,8 @@ def test_without_actions_it_is_still_judged_as_a_reward(demo):
     assert wrong(found) == []
     assert "guided replay" not in verdicts(found)
     assert verdicts(found)["reward progress"] == "ok"
+    assert "a step), nothing was replayed, standing still" in line(found, "reward progress")
+    assert "behaviour cloning (the demonstration has no actions" in line(found, "time")
     assert "correction" not in line(found, "recommended")
 
 
@@ -274,19 +299,44 @@ def test_a_reward_is_judged_by_discounted_returns():
     r = judged("r", [good], [bad], [still], gamma=0.5, time_limit=4)
     # -0.9 - 0.25 - 0.025 = -1.175; -1.1; -1.875
     assert (r.above_still, r.above_failure, r.order, r.freezing) == (1, 0, 1, 0)
+    assert (r.success.value, r.success.step) == pytest.approx((-1.175, -0.5))
+    assert (r.failure.value, r.failure.step) == pytest.approx((-1.1, -0.6))
+    assert (r.still.value, r.still.step) == pytest.approx((-1.875, -1))
     # Paid for each step: 1 + .5 a step more if it stays than if it finishes
     survival = judged("r", [played(1, 1)], [], [played(1, 1, 1, 1)], gamma=0.5, time_limit=4)
     assert survival.above_still == 0
     assert np.isnan(survival.above_failure)
+    assert survival.failure is None
     assert survival.order == 0
     assert survival.freezing == 1
     assert max([r, survival], key=lambda x: x.rank) is r
 
 
+def test_returns_and_steps_are_means_over_episodes_and_over_steps():
+    r = judged("r", [played(1), played(0, 0, 0)], [], [played(0)], gamma=0.5, time_limit=4)
+    assert (r.success.value, r.success.step) == (0.5, 0.25)
+
+
+WORTH = {"success": Worth(-3.2, -0.1), "failure": Worth(-12345.6, -1), "still": Worth(-1e-9, 0)}
+
+
+def test_what_success_failure_and_standing_still_are_worth():
+    shares = {"above_still": 1, "above_failure": 0.5, "order": 0.5, "freezing": 0}
+    (found,) = check_reward([Reward("r", **WORTH, **shares)], "r")
+    assert found.line.startswith(
+        "success is worth -3.2 (-0.1 a step), failure -12346 (-1 a step), standing still -1e-09 "
+        "(0 a step); success above standing still 100%, above failure 50%, order"
+    )
+    shares["above_failure"] = float("nan")
+    (found,) = check_reward([Reward("r", **{**WORTH, "failure": None}, **shares)], "r")
+    assert "(-0.1 a step), no replay failed, standing still" in found.line
+    assert "above failure" not in found.line
+
+
 def test_only_the_reward_that_is_trained_on_is_warned_of():
     both = [
-        Reward("good", above_still=1, above_failure=1, order=0.5, freezing=0),
-        Reward("poor", above_still=0, above_failure=1, order=0.9, freezing=0.8),
+        Reward("good", **WORTH, above_still=1, above_failure=1, order=0.5, freezing=0),
+        Reward("poor", **WORTH, above_still=0, above_failure=1, order=0.9, freezing=0.8),
     ]
     assert verdicts(check_reward(both, "good")) == {"reward good": "ok", "reward poor": "ok"}
     found = check_reward(both, "poor")
