@@ -12,7 +12,7 @@ BIN := .venv/bin
 STAMP := .venv/installed
 SETTINGS := constraints.txt setup.cfg pyproject.toml wrappers/setup.cfg wrappers/pyproject.toml
 
-.PHONY: run test lint docs dist test-oldest clean
+.PHONY: run test lint docs links dist test-oldest clean
 .DELETE_ON_ERROR:
 
 run: $(STAMP)
@@ -28,6 +28,10 @@ lint: $(STAMP)
 
 docs: $(STAMP)
 	$(BIN)/python -m sphinx -W --keep-going docs build/docs
+
+# Whether every address that the documentation names answers; needs the internet
+links: $(STAMP)
+	$(BIN)/python -m sphinx -b linkcheck -q docs build/links
 
 # Wheels and sdists of both, the same to the bit from the same commit
 dist: $(STAMP)
