@@ -109,6 +109,11 @@ class Experiment(ExperimentManager):
     """rl_zoo3's experiment, with what the module's docstring names."""
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        if self.n_timesteps <= 0 and "n_timesteps" not in hyperparams:
+            raise ValueError(
+                f"{self.env_name.gym_id}: its section of the YAML file has no n_timesteps: add it, "
+                "or say -n STEPS"
+            )
         if self.algo == "td3bc":
             for name in EVALUATED:
                 if isinstance(hyperparams.get(name), str):

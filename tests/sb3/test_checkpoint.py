@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import errno
 import multiprocessing
 import os
@@ -14,7 +13,6 @@ import threading
 import time
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -29,15 +27,7 @@ from regil_sb3.checkpoint import (
     Preempted,
     ReplayableEpisode,
     callback,
-    open_episode,
 )
-
-
-def test_the_examples_run(tmp_path):
-    for module in (callback, open_episode):
-        own = {"folder": tmp_path, "gym": gym, "ReplayableEpisode": ReplayableEpisode}
-        failed, tried = doctest.testmod(module, extraglobs=own)
-        assert failed == 0 < tried
 
 
 class Killed(BaseException):

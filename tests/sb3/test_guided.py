@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy import Reach, demonstration
 
-from regil_sb3 import TD3BC, GuidedWarmup, VecRetrievalGuide, VecRetrievalReward, guided
+from regil_sb3 import TD3BC, GuidedWarmup, VecRetrievalGuide, VecRetrievalReward
 
 HIGH = 2.0
 
@@ -132,10 +130,3 @@ def test_bad_input_is_refused(make, steps, message):
     learner = make()
     with pytest.raises(ValueError, match=message):
         learner.learn(20, callback=GuidedWarmup(steps))
-
-
-def test_example(demo):
-    env = VecRetrievalGuide(make_vec_env("ToyReach-v0", 1, env_kwargs={"size": 48}), demo)
-    failed, tried = doctest.testmod(guided, extraglobs={"env": env})
-    assert failed == 0
-    assert tried > 0

@@ -1,6 +1,5 @@
 """Meta-World's tasks: seeds, pictures, endings, processes, bad arguments."""
 
-import doctest
 import gc
 import hashlib
 import os
@@ -15,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
 
 import regil_sb3.envs
-from regil_sb3.envs import METAWORLD_TASKS, metaworld
+from regil_sb3.envs import METAWORLD_TASKS
 from regil_sb3.envs.metaworld import CAMERAS, MetaWorldEnv
 from regil_sb3.envs.rendering import prepare_graphics
 
@@ -76,11 +75,6 @@ def test_registering_imports_no_simulator_and_no_torch():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "set()"
-
-
-def test_example_in_the_docstring_runs():
-    failed, tried = doctest.testmod(metaworld)
-    assert (failed, tried > 0) == (0, True)
 
 
 @pytest.mark.parametrize("obs", ["pixels", "state"])

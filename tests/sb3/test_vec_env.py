@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 from functools import partial
 from typing import Any
 
@@ -24,7 +23,7 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
-from regil_sb3 import TD3BC, VecRetrievalGuide, VecRetrievalReward, vec_env
+from regil_sb3 import TD3BC, VecRetrievalGuide, VecRetrievalReward
 from regil_sb3.relabelling import AfterFirstEpisode, EpisodeRewardReplayBuffer, rewards_come_late
 
 LENGTHS = (7, 12, 7)
@@ -270,9 +269,3 @@ def test_what_does_not_fit(demo_path: str) -> None:
         with pytest.raises(ValueError, match=message) as caught:
             make()
         assert "\n" not in str(caught.value)
-
-
-def test_examples(demo: Demonstration) -> None:
-    failed, tried = doctest.testmod(vec_env, extraglobs={"toy_demo": demo})
-    assert tried > 0
-    assert failed == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 import time
 
@@ -17,7 +16,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from test_checkpoint import At
 from toy import Reach
 
-from regil_sb3 import watch as module
 from regil_sb3.bench.toy import new_model, toy
 from regil_sb3.checkpoint import CheckpointCallback
 from regil_sb3.report import write_report
@@ -34,11 +32,6 @@ def learn(env_class=Reach, steps=110, also=(), file=None, **settings):
     watch = Watch(file, episodes=4, guided=3, frozen=15, hung=0.3)
     new_model(env, **settings).learn(steps, [watch, *also])
     return watch.said
-
-
-def test_the_example_runs():
-    failed, tried = doctest.testmod(module)
-    assert failed == 0 < tried
 
 
 def test_nothing_is_said_of_what_is_well(tmp_path):

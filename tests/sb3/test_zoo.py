@@ -343,6 +343,17 @@ def test_text_that_would_be_evaluated_is_refused(tiny, capsys):
     assert not Path("evaluated").exists()
 
 
+def test_a_section_without_steps_is_named(tiny, capsys):
+    common, _ = tiny
+    section = Path("td3bc.yml")
+    section.write_text(section.read_text().replace("  n_timesteps: 60\n", ""))
+    assert zoo.main(["train", *common]) == 2
+    error = capsys.readouterr().err.strip()
+    assert error.endswith(
+        "ToyReach-v0: its section of the YAML file has no n_timesteps: add it, or say -n STEPS"
+    )
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

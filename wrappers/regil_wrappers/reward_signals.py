@@ -108,9 +108,7 @@ class _Cos(Signal):
 class _Orca(Signal):
     def __init__(self, retriever: Retriever) -> None:
         super().__init__(retriever)
-        self._tau = [
-            len(part) * rewards.demonstration_tau(part) for part in retriever.memory.parts
-        ]
+        self._tau = [len(part) * rewards.demonstration_tau(part) for part in retriever.memory.parts]
 
     def begin(self) -> None:
         self._coverage: list[NDArray[np.float64] | None] = [None] * len(self._tau)
