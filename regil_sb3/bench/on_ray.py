@@ -42,8 +42,8 @@ def connect(address: str, shares: Shares) -> None:
     """Connect this process, unless it is.
 
     Args:
-        address: of the cluster's head; "auto": the one that runs here, else one is started;
-            "local" starts one.
+        address: of the cluster's head; "auto": the one that runs here, or where none does, one is
+            started, and a line says so; "local" starts one.
         shares: a task's.
 
     Raises:
@@ -58,7 +58,12 @@ def connect(address: str, shares: Shares) -> None:
         ) from None
     if not ray.is_initialized():
         try:
-            ray.init(address=None if address == "auto" else address, log_to_driver=False)
+            ray.init(address=address, log_to_driver=False)
+        except ConnectionError as error:
+            if address != "auto":
+                raise ValueError(f"--ray {address}: {' '.join(str(error).split())}") from None
+            print("--ray auto: no cluster runs here, so one of this machine alone is started")
+            ray.init(address="local", log_to_driver=False)
         except (ray.exceptions.RayError, RuntimeError, OSError) as error:
             raise ValueError(f"--ray {address}: {' '.join(str(error).split())}") from None
     alive = [node for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]

@@ -79,7 +79,8 @@ def main(out: str = "bench", page: str = "docs/results.md") -> None:
 
 def _written(out: Path, name: str) -> list[Path]:
     """A table's files: of its own steps, then of others (``NAME-STEPS.md``)."""
-    longer = {int(p.stem[len(name) + 1 :]): p for p in out.glob(f"{name}-[0-9]*.md")}
+    others = {path.stem[len(name) + 1 :]: path for path in out.glob(f"{name}-*.md")}
+    longer = {int(steps): path for steps, path in others.items() if steps.isdecimal()}
     paths = [out / f"{name}.md", *(longer[steps] for steps in sorted(longer))]
     return [path for path in paths if path.exists()]
 
@@ -93,9 +94,7 @@ def _learning(out: Path, name: str) -> tuple[str, list[str]]:
     try:
         of_rows = zip(columns["method"], columns["run"], columns["evaluated"], strict=True)
     except KeyError as error:
-        raise ValueError(
-            f"{rows} has no column {error}: regil bench {name} makes it anew"
-        ) from None
+        raise ValueError(f"{rows} has no column {error}: its command makes it anew") from None
     named: dict[str, list[RunContents]] = {}
     gone = []
     for method, run, evaluated in dict.fromkeys(of_rows):

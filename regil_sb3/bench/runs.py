@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import active_children, get_context
 from pathlib import Path
@@ -204,6 +205,8 @@ def finish(run: Run) -> None:
         return
     run.folder.mkdir(parents=True, exist_ok=True)
     _wait_for_others(run)
+    if run.finished:
+        return
     begun, took, here = time.time(), seconds_of(run) or 0.0, describe(_PACKAGES)
     _write_took(run, took, here)
     process = get_context("spawn").Process(target=_train, args=(run,))
@@ -359,11 +362,20 @@ def _here(runs: Sequence[Run], workers: int, show: Callable[[], None]) -> list[s
             pool.shutdown(wait=False, cancel_futures=True)
             begun = [future for future in futures if not future.cancelled()]
             told: set[int | None] = set()
-            while wait(begun, 0.2).not_done:  # they save themselves
-                for child in active_children():
-                    if child.pid is not None and child.pid not in told:
-                        os.kill(child.pid, signal.SIGINT)
-                        told.add(child.pid)
+            again = time.monotonic() + _GRACE
+            while True:  # they save themselves
+                try:
+                    if not wait(begun, 0.2).not_done:
+                        break
+                    if time.monotonic() > again:
+                        told, again = set(), again + _GRACE
+                    for child in active_children():
+                        if child.pid is not None and child.pid not in told:
+                            with suppress(ProcessLookupError):
+                                os.kill(child.pid, signal.SIGINT)
+                            told.add(child.pid)
+                except KeyboardInterrupt:  # once more: a save that takes long is broken off
+                    told = set()
             raise
         show()
     return [str(future.exception() or "") for future in futures]

@@ -34,6 +34,8 @@ __all__ = ["check_cost"]
 
 _EVALUATIONS = 7  # of the policy while it learns: after the warm-up, then every sixth of the steps
 _EPISODE = 20  # steps in the stand-in
+_STEPS = 4  # that are timed together: two updates of the default's
+_UNABLE = (TypeError, ValueError, RuntimeError, ArithmeticError, MemoryError)
 _ENOUGH, _MOST = 1.0, 40  # seconds and calls that one measurement takes; at least one call
 _BUSY = 0.8  # of a core: a learner that gets less is slower than it could be
 
@@ -116,11 +118,11 @@ def check_cost(
         except ValueError as error:
             learning = _measured(env, None, settings, {"bc_coef": 0.0})
             left_out.append(f"behaviour cloning ({error})")
-    except (TypeError, ValueError) as error:  # TypeError: an argument that the policy does not have
+    except _UNABLE as error:  # TypeError: an argument that the policy does not have
         line = (
             f"{settings.steps:,} steps of environment and retrieval, {1000 * seconds:.0f} ms each, "
             f"take {_minutes(settings.steps * seconds)}; learning could not begin with these "
-            f"settings: {error}"
+            f"settings: {error or type(error).__name__}"
         )
         return [Finding("time", "warning", line)]
     return [_memory(learning, settings), _time(learning, settings, seconds, longest, left_out)]
@@ -142,6 +144,9 @@ def _memory(learning: _Learning, settings: Settings) -> Finding:
         f"{', '.join(parts)}; {free / 1e9:.1f} GB are free; not counted: "
         f"{n} more environment{'s' * (n > 1)}, as training has {n + 1}"
     )
+    if learning.kept > 0.8 * free:
+        most = max(int(0.5 * _setting(settings, "success_buffer_size") * free / learning.kept), 1)
+        return Finding("memory", "wrong", f"{line}: set success_buffer_size to at most {most}")
     if full + learning.kept > free:
         most = max(int(0.8 * learning.transitions * (free - learning.kept) / full), 1)
         return Finding("memory", "wrong", f"{line}: set buffer_size to at most {most}")
@@ -219,7 +224,7 @@ def _measured(
 
     def more() -> int:
         before = model.num_timesteps
-        model.learn(_EPISODE, reset_num_timesteps=False)
+        model.learn(_STEPS, reset_num_timesteps=False)
         return model.num_timesteps - before
 
     begun, busy = time.perf_counter(), time.process_time()

@@ -125,9 +125,8 @@ def commands(page: str) -> list[str]:
         if block.startswith("#!"):
             continue
         turn = dict(re.findall(r"\bfor (\w+) in (\S+)", block))
-        code = re.sub(
-            r"(?m)(^|\s)#.*$| \.\.\.(?=\s|$)|\bfor \w+ in [^;\n]*; *do\b|\bdone\b", "\n", block
-        )
+        code = re.sub(r"(?m)(^|\s)#.*$|\bfor \w+ in [^;\n]*; *do\b|\bdone\b", "\n", block)
+        code = re.sub(r" \.\.\.(?=\s|$)", "", code)
         code = re.sub(r"\$(\w+)", lambda m, turn=turn: turn[m[1]], code)
         found += [line.strip() for line in re.split(r"[;\n]", code) if line.strip()]
     return found
@@ -308,6 +307,7 @@ def not_run(command: str) -> str | None:
     return next((why for of, why in NOT_RUN.items() if re.match(of, command)), None)
 
 
+@pytest.mark.timeout(900)  # a page of many commands, on busy cores
 @pytest.mark.filterwarnings("ignore:calibration")  # does not fit into episodes so short
 @pytest.mark.usefixtures("fresh")
 @pytest.mark.parametrize("page", dict.fromkeys(page for page, c in COMMANDS if not_run(c) is None))

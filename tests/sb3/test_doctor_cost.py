@@ -42,9 +42,9 @@ def gigabytes(found, what):
 
 
 def test_all_parts_are_counted(demo):
-    found = checked(demo)
-    assert {f.verdict for f in found.values()} == {"ok"}
-    line = found["time"].line
+    assert {f.verdict for f in checked(demo).values()} == {"ok"}
+    learning = cost._Learning(0.02, 0.002, 0.9, offline=False, first=0.01, firsts=4_000)
+    line = cost._time(learning, make_settings(ENV), 0.006, 70, []).line
     assert re.match(r"15,000 steps take [\d.]+ min to [\d.]+ min: ", line)
     assert "environment and retrieval 6.0 ms a step (1.5 min)" in line
     assert "4,000 updates by behaviour cloning before" in line
@@ -54,8 +54,8 @@ def test_all_parts_are_counted(demo):
         float(x) for x in re.match(r"15,000 steps take (\S+) min to (\S+)", line).groups()
     )
     parts = [float(x) for x in re.findall(r"\((?:up to )?([\d.]+) min\)", line)]
-    assert least == pytest.approx(sum(parts[:3]), abs=0.7)
-    assert most == pytest.approx(sum(parts), abs=0.7)
+    assert parts == [1.5, 5.0, 0.7, 0.7]
+    assert (least, most) == (7.2, 7.8)
 
 
 def test_memory_is_that_of_process_and_buffers(demo):
@@ -79,6 +79,12 @@ def test_a_replay_buffer_that_does_not_fit(demo):
     assert (
         int(re.search(r"set buffer_size to at most (\d+)", found["memory"].line)[1]) < 900_000_000
     )
+
+
+def test_a_success_buffer_that_does_not_fit(demo):
+    found = checked(demo, ["success_buffer_size=900000000"])
+    assert found["memory"].verdict == "wrong"
+    assert "set success_buffer_size to at most " in found["memory"].line
 
 
 def test_more_updates_take_longer(demo):
@@ -129,6 +135,7 @@ def test_without_actions(demo):
         (["env_kwargs.obs=dict"], "MultiInputPolicy"),
         (["policy=MlpPolicy"], "shared_encoder"),
         (["batch_size=0"], "batch_size is 0"),
+        (["learning_rate=1000000.0"], "training stopped"),
     ],
 )
 def test_a_learner_that_cannot_begin_is_warned_of(demo, overrides, why):

@@ -200,8 +200,19 @@ def test_a_run_that_another_process_still_saves_is_waited_for(runs, failed, monk
         (error,) = finish_all([runs[2]])
         assert "is learning in" in error
         assert time.monotonic() - began > 0.3
+    monkeypatch.setattr(runs_module, "_GRACE", 60.0)
+    held = threading.Event()
+
+    def hold(_):
+        held.set()  # the first look found it locked
+        saving.__exit__(None, None, None)
+
+    saving = locked(runs[2].folder)
+    saving.__enter__()
+    monkeypatch.setattr(runs_module.time, "sleep", hold)
     (error,) = finish_all([runs[2]])
-    assert "see log.txt there" in error
+    assert held.is_set()
+    assert "see log.txt there" in error  # its turn came
 
 
 _INTERRUPTED = """
@@ -216,17 +227,26 @@ if __name__ == "__main__":
 """
 
 
-def test_an_interrupted_bench_lets_its_runs_save_themselves(tmp_path):
+@pytest.mark.parametrize("signalled", ["group", "alone"])  # by a terminal, by a scheduler
+def test_an_interrupted_bench_lets_its_runs_save_themselves(tmp_path, signalled):
     script = tmp_path / "bench.py"
     script.write_text(_INTERRUPTED.format(str(tmp_path)))
     path = os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")])
-    bench = subprocess.Popen([sys.executable, script], env=os.environ | {"PYTHONPATH": path})
+    bench = subprocess.Popen(
+        [sys.executable, script], env=os.environ | {"PYTHONPATH": path}, start_new_session=True
+    )
     folders = [toy_run(tmp_path, seed=seed, steps=100_000).folder for seed in range(3)]
-    while not all((folder / "progress.csv").exists() for folder in folders[:2]):
-        assert bench.poll() is None
-        time.sleep(0.1)
-    bench.send_signal(signal.SIGINT)  # it alone, as a scheduler does
-    assert bench.wait(60) != 0
+    try:
+        while not all((folder / "progress.csv").exists() for folder in folders[:2]):
+            assert bench.poll() is None
+            time.sleep(0.1)
+        if signalled == "group":
+            os.killpg(bench.pid, signal.SIGINT)
+        else:
+            bench.send_signal(signal.SIGINT)
+        assert bench.wait(120) != 0
+    finally:
+        bench.kill()  # its runs end with it
     for folder in folders[:2]:
         assert has_checkpoint(folder)
         with locked(folder):  # nobody goes on with it

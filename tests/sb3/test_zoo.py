@@ -265,7 +265,9 @@ class Meeting(toy_env.ToyReach):
     def step(self, action):  # as a trial does: it waits until the other worker is in one, too
         Path("met").mkdir(exist_ok=True)
         Path(f"met/{os.getpid()}").touch()
+        end = time.monotonic() + 120
         while len(list(Path("met").iterdir())) < 2:
+            assert time.monotonic() < end, "the other worker never came"
             time.sleep(0.02)
         return super().step(action)
 
