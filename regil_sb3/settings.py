@@ -114,6 +114,11 @@ class Settings:
         default = known["warmup_steps"].default if "warmup_steps" in known else 0
         return int(self.hyperparams.get("warmup_steps", default))
 
+    @property
+    def eval_every(self) -> int:
+        """Agent steps between two evaluations as it learns."""
+        return max(self.steps // 6, 1)
+
     def retrieval(self, name: str) -> Any:
         """An argument that the retrieval wrappers share, such as ``encoder``."""
         for entry in self.env_wrapper:

@@ -278,10 +278,9 @@ def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> N
             )
         log.unlink(missing_ok=True)
         (run / "warnings.jsonl").unlink(missing_ok=True)
-    every = max(settings.steps // 6, 1)
     # The callback reads the log before it is reopened
     watch = Watch(run / "warnings.jsonl")
-    callback = TrainingCallback(run, eval_env, every, settings.eval_episodes, watch)
+    callback = TrainingCallback(run, eval_env, settings.eval_every, settings.eval_episodes, watch)
     formats: list[KVWriter] = [
         Forgiving(log.name, lambda: AppendingCSV(log)),
         Forgiving("TensorBoard's log", lambda: TensorBoardOutputFormat(str(run))),

@@ -32,7 +32,6 @@ from regil_sb3.td3bc import TD3BC
 
 __all__ = ["check_cost"]
 
-_EVALUATIONS = 7  # of the policy while it learns: after the warm-up, then every sixth of the steps
 _EPISODE = 20  # steps in the stand-in
 _STEPS = 4  # that are timed together: two updates of the default's
 _UNABLE = (TypeError, ValueError, RuntimeError, ArithmeticError, MemoryError)
@@ -159,7 +158,9 @@ def _time(
     played = 0.0 if learning.offline else settings.steps * seconds
     learned = settings.steps * learning.step
     first = learning.firsts * learning.first
-    episodes = _EVALUATIONS * settings.eval_episodes
+    every, warmup = settings.eval_every, settings.warmup_steps
+    # After the warm-up, and then from time to time
+    episodes = (1 + settings.steps // every - warmup // every) * settings.eval_episodes
     judged = episodes * longest * (seconds + learning.act)
     parts = [f"{'updates' if learning.offline else 'learner'} {1000 * learning.step:.1f} ms a step"]
     parts[0] += f" ({_minutes(learned)})"
