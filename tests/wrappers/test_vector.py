@@ -365,7 +365,7 @@ def test_a_step_without_final_observations(demo_path: str) -> None:
     env = vector.RetrievalRewardWrapper(
         Forgets([partial(toy, 2)], autoreset_mode=AutoresetMode.SAME_STEP), demo_path
     )
-    env.reset()
+    env.reset(seed=0)
     env.step(np.zeros((1, 2)))
     refused(lambda: env.step(np.zeros((1, 2))), r"without infos\['final_obs'\]")
 
