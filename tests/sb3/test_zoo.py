@@ -233,7 +233,8 @@ def curves_of(figure):
     return plt.figure(figure).axes[0].lines
 
 
-@pytest.mark.filterwarnings("ignore:When grouping with a length-1:FutureWarning")  # older seaborn
+# rl_zoo3's drawing with older pandas
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 def test_plots_of_runs(tiny, monkeypatch):
     common, _ = tiny
     few = ["-n", "65", "--eval-freq", "30", "--eval-episodes", "2"]
