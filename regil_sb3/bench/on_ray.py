@@ -58,12 +58,13 @@ def connect(address: str, shares: Shares) -> None:
         ) from None
     if not ray.is_initialized():
         try:
-            ray.init(address=address, log_to_driver=False)
-        except ConnectionError as error:
-            if address != "auto":
-                raise ValueError(f"--ray {address}: {' '.join(str(error).split())}") from None
-            print("--ray auto: no cluster runs here, so one of this machine alone is started")
-            ray.init(address="local", log_to_driver=False)
+            try:
+                ray.init(address=address, log_to_driver=False)
+            except ConnectionError:
+                if address != "auto":
+                    raise
+                print("--ray auto: no cluster runs here, so one of this machine alone is started")
+                ray.init(address="local", log_to_driver=False)
         except (ray.exceptions.RayError, RuntimeError, OSError) as error:
             raise ValueError(f"--ray {address}: {' '.join(str(error).split())}") from None
     alive = [node for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
