@@ -4,7 +4,7 @@
 
 Run folders of `regil train` are taken into that file first, each in place of an older one of the
 same task and seed. Success is what `progress.csv` holds: the policy on unseen episodes, evaluated
-when the warm-up has ended and every sixth of the run after it.
+when the warm-up has ended and from time to time after it.
 """
 
 import csv

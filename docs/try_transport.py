@@ -17,7 +17,8 @@ from regil_wrappers.registration import moved_back, register
 from regil_wrappers.rewards import demonstration_tau, orca_reward, orca_step
 from regil_wrappers.transport import band, context_costs, cosine_costs, transport_plan
 
-from regil_sb3.bench.rewards import TASKS, _episodes
+from regil_sb3.bench.ranking import _episodes
+from regil_sb3.bench.replay import TASKS
 from regil_sb3.recording import record_expert
 
 

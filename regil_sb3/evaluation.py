@@ -21,7 +21,9 @@ from stable_baselines3.common.preprocessing import (
 )
 from stable_baselines3.common.vec_env import VecEnv
 
-EVALUATION_SEED = 1_000_000
+from regil_sb3.envs import EVALUATION_SEEDS
+
+EVALUATION_SEED = EVALUATION_SEEDS
 SELECTION_SEED = 2_000_000
 
 METHODS = {

@@ -34,7 +34,7 @@ _NOT_SETTABLE = {
     "_init_setup_model",
 }
 _OWN = (
-    *("n_timesteps", "n_envs", "frame_stack", "policy", "eval_episodes"),
+    *("n_timesteps", "n_envs", "frame_stack", "policy", "eval_episodes", "eval_freq"),
     *("env_kwargs", "env_wrapper"),
 )
 
@@ -68,6 +68,7 @@ class Settings:
         frame_stack: frames in an observation.
         policy: name of the policy.
         eval_episodes: unseen episodes each time that the policy is evaluated during training.
+        eval_freq: agent steps between two evaluations; None: 2,500, or a sixth of a shorter run.
         hyperparams: arguments of the algorithm.
     """
 
@@ -80,6 +81,7 @@ class Settings:
     frame_stack: int = 2
     policy: str = "CnnPolicy"
     eval_episodes: int = 10
+    eval_freq: int | None = None
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     env_wrapper: list[Any] = field(default_factory=list)
     hyperparams: dict[str, Any] = field(default_factory=dict)
@@ -100,7 +102,7 @@ class Settings:
         """
         try:
             read = yaml.safe_load(path.read_text(encoding="utf-8"))
-            read = {"algo": "td3bc", **read}  # which older runs do not say
+            read = {"algo": "td3bc", "eval_freq": None, **read}  # which older runs do not say
             return cls(**{name: read[name] for name in cls.__dataclass_fields__})
         except _UNREADABLE as error:
             raise ValueError(
@@ -117,7 +119,7 @@ class Settings:
     @property
     def eval_every(self) -> int:
         """Agent steps between two evaluations as it learns."""
-        return max(self.steps // 6, 1)
+        return self.eval_freq or max(min(self.steps // 6, 2_500), 1)
 
     def retrieval(self, name: str) -> Any:
         """An argument that the retrieval wrappers share, such as ``encoder``."""
@@ -233,8 +235,10 @@ def make_settings(
         _override(settings, key, value)
     if steps is not None:
         settings.steps = steps
-    for name in ("steps", "n_envs", "frame_stack", "eval_episodes"):
+    for name in ("steps", "n_envs", "frame_stack", "eval_episodes", "eval_freq"):
         value = getattr(settings, name)
+        if name == "eval_freq" and value is None:
+            continue
         if type(value) is not int or value < 1:
             raise ValueError(f"{name} is {value!r}: it must be a whole number of at least 1")
     for name in settings.hyperparams:
@@ -283,7 +287,7 @@ def _override(settings: Settings, key: str, value: Any) -> None:
     model = set(inspect.signature(ALGOS[settings.algo]).parameters) - _NOT_SETTABLE
     wrappers = {n for c in RETRIEVAL.values() for n in inspect.signature(c).parameters}
     wrappers -= {"env", "demo"}
-    own = set(_OWN[:5])
+    own = set(_OWN[:6])
     if key.startswith("env_kwargs."):
         settings.env_kwargs[key.removeprefix("env_kwargs.")] = value
     elif key.startswith("policy_kwargs."):

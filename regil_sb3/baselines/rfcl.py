@@ -30,7 +30,8 @@ class ReverseForwardCurriculum(
     episodes is taken three times as often as one solved in all of them, and one never solved twice.
 
     A state of the demonstration is reached by playing its actions from its own seed, inside
-    `reset`: such steps are nobody's, as states that a simulator is set to. The reward is 1 at
+    `reset`: such steps are nobody's, as states that a simulator is set to. Whether they lead
+    there is not compared: it must be a demonstration of this very environment. The reward is 1 at
     success, else 0. Only
     ``reset(seed=None)`` is chosen for; with a seed the episode is as it was asked for, which is how
     a policy is evaluated.
@@ -48,7 +49,7 @@ class ReverseForwardCurriculum(
 
     Raises:
         ValueError: a number is out of range, or the demonstration lacks its actions or its seed;
-            from `reset`: if its actions do not lead through its frames here.
+            from `reset`: if an episode ends before its actions do.
     """
 
     def __init__(

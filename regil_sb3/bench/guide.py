@@ -19,6 +19,7 @@ import numpy.typing as npt
 from regil_wrappers import Demonstration, RetrievalGuideWrapper
 
 from regil_sb3.bench.replay import (
+    TASKS,
     check,
     demonstration,
     env_id,
@@ -27,7 +28,6 @@ from regil_sb3.bench.replay import (
     guides,
     play,
 )
-from regil_sb3.bench.rewards import TASKS
 from regil_sb3.bench.timing import Timed
 from regil_sb3.envs import EVALUATION_SEEDS
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from regil_wrappers import Demonstration, Retriever
 from regil_wrappers.alignment import accumulated_costs, best_end, squared_distances, warping_path
 from regil_wrappers.encoders import Encoder, make_encoder
+from regil_wrappers.encoders.weights import MissingWeightsError
 from regil_wrappers.latency import Latency
 from regil_wrappers.retrieval import step_together
 
@@ -108,7 +109,7 @@ def latency(
     for name in encoders:
         try:
             encoder = make_encoder(name)
-        except ImportError as error:
+        except (ImportError, MissingWeightsError) as error:
             yield Row(name, 0, "", missing=str(error))
             continue
         for length in frames:

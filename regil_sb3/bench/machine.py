@@ -56,13 +56,18 @@ def _processor() -> str:
 
 
 def _commit() -> str:
-    """Of the checkout that this file is in, with a + where something in it was changed."""
+    """Of the checkout that this file is of, with a + where something in it was changed."""
     here = Path(__file__).parent
+    asked = (
+        ("rev-parse", "--short", "HEAD"),
+        ("status", "--porcelain", "-uno"),
+        ("ls-files", "--error-unmatch", Path(__file__).name),  # not in somebody else's
+    )
     try:
-        done = [
+        commit, changed, _ = (
             subprocess.run(["git", "-C", here, *words], capture_output=True, text=True, check=True)
-            for words in (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "-uno"))
-        ]
+            for words in asked
+        )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return done[0].stdout.strip() + ("+" if done[1].stdout.strip() else "")
+    return commit.stdout.strip() + ("+" if changed.stdout.strip() else "")

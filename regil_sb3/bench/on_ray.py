@@ -80,7 +80,11 @@ def connect(address: str, shares: Shares) -> None:
 
 
 def call_all(
-    function: Callable[[T], None], arguments: Sequence[T], shares: Shares, show: Callable[[], None]
+    function: Callable[[T], None],
+    arguments: Sequence[T],
+    shares: Shares,
+    show: Callable[[], None],
+    grace: float,
 ) -> list[str]:
     """Call a function with each argument, somewhere on the cluster.
 
@@ -89,9 +93,13 @@ def call_all(
         arguments: of the tasks.
         shares: that each has.
         show: called every few seconds.
+        grace: s that calls are given to end when this one is interrupted: each is, too.
 
     Returns:
         for each argument "", or in a line why the call failed.
+
+    Raises:
+        KeyboardInterrupt: passed on when all have ended, or the grace is over.
     """
     import ray
 
@@ -102,9 +110,15 @@ def call_all(
         max_retries=_AGAIN,
     )(function)
     pending = references = [task.remote(argument) for argument in arguments]
-    while pending:
-        _, pending = ray.wait(pending, num_returns=len(pending), timeout=SHOWN_EVERY)
-        show()
+    try:
+        while pending:
+            _, pending = ray.wait(pending, num_returns=len(pending), timeout=SHOWN_EVERY)
+            show()
+    except BaseException:
+        for reference in pending:
+            ray.cancel(reference)
+        ray.wait(pending, num_returns=len(pending), timeout=grace)
+        raise
     errors = []
     for reference in references:
         try:

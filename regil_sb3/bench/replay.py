@@ -1,5 +1,6 @@
 """Guided replay, as tables measure it.
 
+* ``TASKS`` - the paper's of Meta-World
 * ``guides`` - arguments of each guide that exists
 * ``env_id``, ``task_of``, ``env_kwargs``, ``check`` - environments by the names that tables take
 * ``demonstration``, ``play``, ``follow`` - an episode of the expert's, and of a guide
@@ -21,6 +22,7 @@ from regil_sb3.recording import check_seeds, record_expert
 from regil_sb3.settings import make_settings, presets
 
 __all__ = [
+    "TASKS",
     "check",
     "demonstration",
     "env_id",
@@ -30,6 +32,16 @@ __all__ = [
     "play",
     "task_of",
 ]
+
+TASKS = (
+    "button-press",
+    "door-open",
+    "drawer-close",
+    "drawer-open",
+    "hammer",
+    "window-close",
+    "window-open",
+)
 
 
 def guides() -> dict[str, dict[str, Any]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from regil_sb3.intervals import Interval, iqm
 __all__ = ["LEARNING", "main", "planned", "raw", "table"]
 
 LEVELS = (0.8, 0.95)
+_ENOUGH = 5  # runs of a task, for a 95 % interval that is nearly one (docs/interval_coverage.py)
 
 
 LEARNING = tuple(name for name, table in said().items() if "methods" in table)
@@ -70,6 +72,7 @@ def planned(
             preset=asked.get("preset", ""),
             settings=tuple(asked.get("settings", ())),
             called=asked.get("run", ""),
+            paper=asked.get("paper", ""),
             beside=tuple(asked.get("beside", {}).items()),
             demo=str(Path(root) / "demos" / f"{task}-{seed}.hdf5"),
         )
@@ -101,6 +104,7 @@ def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
                     "task": task_of(run.env),
                     "method": method,
                     "run": run.folder.name,
+                    "machines": "; ".join(machines([run])),
                     "evaluated": name,
                     "seed": run.seed,
                     "steps": run.steps,
@@ -129,7 +133,7 @@ def table(runs: Sequence[Run]) -> list[str]:
     rows = list(raw(runs))
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    names = {run.method: run.called or run.method for run in runs}  # the paper's
+    names = {run.method: run.paper or run.method for run in runs}
     paper = said()["paper"]["success"]
     lines = [
         f"| method | {' | '.join(tasks)} | IQM (95 %) | runs | steps to .8 | steps to .95 | "
@@ -181,6 +185,15 @@ def _paper_reached(rows: Sequence[Mapping[str, Any]]) -> str:
                 told += f"The paper's {method} reaches .95 on {task} after {first:,} to {last:,} "
                 told += "frames (two an agent step). "
     return told
+
+
+def _narrow(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What a bootstrap's interval of so few runs is worth."""
+    runs = {(row["task"], row["method"], row["seed"]) for row in rows}
+    fewest = min(Counter((task, method) for task, method, _ in runs).values())
+    if not 1 < fewest < _ENOUGH:
+        return ""
+    return f"Intervals of {fewest} runs a task are too narrow (docs/bench.md). "
 
 
 def _better(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -261,7 +274,8 @@ def main(
         seeds = ", ".join(map(str, sorted({row["seed"] for row in rows})))
         hours = sum(seconds_of(run) or 0 for run in runs if run.finished) / 3600
         below = (
-            f"{_better(rows)}{_paper_reached(rows)}Seeds {seeds}; {hours:.1f} hours, one run after "
+            f"{_better(rows)}{_paper_reached(rows)}{_narrow(rows)}"
+            f"Seeds {seeds}; {hours:.1f} hours, one run after "
             f"the other; {together(machines(runs))}"
         )
         steps = options.get("steps")

@@ -50,6 +50,7 @@ _PACKAGES = ("gymnasium", "metaworld", "mujoco", "stable-baselines3", "torch", "
 
 _SECONDS_A_STEP = 15 * 60 / 15_000  # of one core, until a run has told
 _GRACE = 60.0  # s that an interrupted run is given to save itself
+_LOST = 240.0  # s until a file system of several machines has given up a lost one's lock
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ class Run:
         settings: "KEY=VALUE" on top of it.
         called: its name in the folder's, where a run is shared that another table calls otherwise;
             "": ``method``.
+        paper: its name in the paper's figures; "": ``method``.
         beside: what else is evaluated in it, a name in tables and one of
             `regil_sb3.evaluation.METHODS` each.
     """
@@ -82,6 +84,7 @@ class Run:
     preset: str = ""
     settings: tuple[str, ...] = ()
     called: str = ""
+    paper: str = ""
     beside: tuple[tuple[str, str], ...] = ()
 
     @property
@@ -194,8 +197,12 @@ def predicted_hours(runs: Sequence[Run], workers: int) -> float:
     return rate * sum(run.steps for run in runs if not run.finished) / max(workers, 1) / 3600
 
 
-def finish(run: Run) -> None:
+def finish(run: Run, patience: float = 60.0) -> None:
     """Train, or go on, and evaluate.
+
+    Args:
+        run: what is to be finished.
+        patience: s that another process may still hold it, saving it.
 
     Raises:
         RuntimeError: it could not be done; ``log.txt`` in the run's folder says why.
@@ -204,15 +211,17 @@ def finish(run: Run) -> None:
     if run.finished:
         return
     run.folder.mkdir(parents=True, exist_ok=True)
-    _wait_for_others(run)
+    _wait_for_others(run, patience)
     if run.finished:
         return
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # the run's, and said below tables
     begun, took, here = time.time(), seconds_of(run) or 0.0, describe(_PACKAGES)
     _write_took(run, took, here)
     process = get_context("spawn").Process(target=_train, args=(run,))
     process.start()
     try:
-        process.join()
+        while process.is_alive():
+            process.join(1.0)  # Ray's way to interrupt waits for Python's own code
     except BaseException:
         assert process.pid is not None
         os.kill(process.pid, signal.SIGINT)  # it saves itself
@@ -224,11 +233,15 @@ def finish(run: Run) -> None:
         raise RuntimeError(f"{run.folder} ended with status {process.exitcode}: see log.txt there")
 
 
-def _wait_for_others(run: Run) -> None:
+def _finish_there(run: Run) -> None:
+    finish(run, _LOST)
+
+
+def _wait_for_others(run: Run, patience: float) -> None:
     """Another process may still save it: its worker was lost, and this is the second one."""
     from regil_sb3.run_folder import locked
 
-    end = time.monotonic() + _GRACE
+    end = time.monotonic() + patience
     while True:
         try:
             with locked(run.folder):
@@ -249,7 +262,6 @@ def _train(run: Run) -> None:
     log = os.open(run.folder / "log.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(log, 1)
     os.dup2(log, 2)
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported
 
     from regil_wrappers import Demonstration
 
@@ -317,7 +329,7 @@ def finish_all(
         bar.n = bar.initial = sum(_steps_done(run) for run in todo)
         if ray:
             there = [_absolute(run) for run in todo]  # workers have another current folder
-            results = call_all(finish, there, shares, show)
+            results = call_all(_finish_there, there, shares, show, _GRACE)
         else:
             results = _here(todo, workers, show)
         return [
@@ -328,11 +340,14 @@ def finish_all(
 def _record(runs: Sequence[Run]) -> None:
     """Make the demonstrations that are not there, once for all runs that share them."""
     from regil_sb3.recording import record_expert
+    from regil_sb3.settings import encoder_size
 
     missing = {run.demo: run for run in runs if not Path(run.demo).exists()}
     for demo, run in tqdm(missing.items(), desc="demonstrations", disable=not missing):
         Path(demo).parent.mkdir(parents=True, exist_ok=True)
-        record_expert(run.env, run.seed).save(demo)
+        settings = run.settings_now
+        size = encoder_size(settings)
+        record_expert(run.env, run.seed, settings.env_kwargs, size).save(demo)
 
 
 def _absolute(run: Run) -> Run:

@@ -18,8 +18,16 @@ from regil_wrappers.encoders.weights import MissingWeightsError
 
 from regil_sb3.bench.cells import Cell, below, finish, rows
 from regil_sb3.bench.page import need_parquet, said, write
-from regil_sb3.bench.replay import check, demonstration, env_id, env_kwargs, guides, play, task_of
-from regil_sb3.bench.rewards import TASKS
+from regil_sb3.bench.replay import (
+    TASKS,
+    check,
+    demonstration,
+    env_id,
+    env_kwargs,
+    guides,
+    play,
+    task_of,
+)
 from regil_sb3.envs import EVALUATION_SEEDS
 from regil_sb3.intervals import wilson
 

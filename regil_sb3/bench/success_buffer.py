@@ -17,8 +17,7 @@ from regil_wrappers import RetrievalGuideWrapper
 
 from regil_sb3.bench.cells import Cell, below, finish, rows
 from regil_sb3.bench.page import need_parquet, said, write
-from regil_sb3.bench.replay import check, demonstration, env_id, env_kwargs, guides
-from regil_sb3.bench.rewards import TASKS
+from regil_sb3.bench.replay import TASKS, check, demonstration, env_id, env_kwargs, guides
 
 __all__ = ["Planned", "collected", "main", "planned", "table"]
 
@@ -51,7 +50,7 @@ def planned(
         for seed in seeds:  # what shares a demonstration is measured in a row
             for name, guide in guides().items():
                 asked = {
-                    "measured": "success buffer of a guided warm-up",
+                    "measured": "success buffer of a guided warm-up, begun at another goal",
                     "env": env_id(task),
                     "env_kwargs": env_kwargs(task),
                     "seed": seed,
@@ -83,7 +82,8 @@ def collected(task: str, seed: int, steps: int, guide: Mapping[str, Any]) -> dic
     env = RetrievalGuideWrapper(gym.make(env_id(task), **env_kwargs(task)), demo, **guide)
     found = {"transitions": 0, "episodes": 0, "successes": 0}
     length = 0
-    env.reset(seed=seed)
+    env.reset(seed=seed)  # the goal of the demonstration, which would be replayed
+    env.reset()  # as training does
     for _ in range(steps):
         *_, terminated, truncated, info = env.step(env.disturbed_action())
         length += 1

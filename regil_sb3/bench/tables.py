@@ -221,7 +221,7 @@ def main(table: str, **options: Any) -> list[Row]:
     Args:
         table: one of `TABLES`; "guide", "success-buffer", "sensitivity", "buffer-vs-learning",
             "trajectories", "real-time" or "results" (modules of their names); "ranking"
-            (`regil_sb3.bench.rewards`); "memory" or "index" (`regil_sb3.bench.memory`); "latency",
+            (`regil_sb3.bench.ranking`); "memory" or "index" (`regil_sb3.bench.memory`); "latency",
             "throughput" or "faults" (modules of their names); or one of
             `regil_sb3.bench.run_tables.LEARNING`.
         **options: the table's own.
@@ -267,9 +267,9 @@ def main(table: str, **options: Any) -> list[Row]:
         faults.main(**options)
         return []
     if table == "ranking":
-        from regil_sb3.bench import rewards
+        from regil_sb3.bench import ranking
 
-        rewards.main()
+        ranking.main()
         return []
     if table not in TABLES:
         raise ValueError(f"table {table!r} is not one of {', '.join([*TABLES, *_ROOMS])}")

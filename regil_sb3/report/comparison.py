@@ -211,10 +211,14 @@ def scores(named: Named) -> str:
 
 
 def _curves(named: Named) -> str:
-    """IQM of the policy's evaluations over steps, where every run of a method has one."""
+    """IQM of the policy's evaluations over steps, where every run of a method has one.
+
+    What learns from the demonstration alone makes no steps, and has no curve.
+    """
     lines = []
     for i, (name, runs) in enumerate(named.items()):
-        logged = [(run.env, column(run.rows, "eval/success_rate")) for run in runs]
+        moving = [run for run in runs if run.evaluation.get("frames") != 0]
+        logged = [(run.env, column(run.rows, "eval/success_rate")) for run in moving]
         logged = [(env, curve) for env, curve in logged if curve]
         curves = [curve for _, curve in logged]
         if not curves:

@@ -209,6 +209,9 @@ def test_a_guide_that_is_followed():
         success_buffer.collected("button-press", 0, 165, guides[name])
         for name in ("plain", "corrected")
     )
+    # the first goal is not the demonstration's, where its 31 actions would do
+    early = success_buffer.collected("button-press", 0, 31, guides["plain"])
+    assert early == {"transitions": 0, "episodes": 0, "successes": 0}
     # the first 125 steps calibrate, and the last episode may be open
     assert plain["transitions"] < corrected["transitions"] <= 40
     assert corrected["successes"] < corrected["episodes"]

@@ -1,5 +1,7 @@
 """`regil bench latency`, and the packages that it compares with as oracles."""
 
+import re
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -12,6 +14,7 @@ from regil_wrappers.alignment import (
     squared_distances,
     warping_path,
 )
+from regil_wrappers.encoders.weights import MissingWeightsError
 
 from regil_sb3.bench import latency, machine, tables
 from regil_sb3.bench.peers import LIBROSA_ON_COSTS, PEERS
@@ -129,6 +132,33 @@ def test_bad_options_get_one_line(words, message, capsys):
 def test_retrieval_has_no_encoders():
     with pytest.raises(ValueError, match="the table 'retrieval' has no option --encoders"):
         tables.main("retrieval", encoders=["pixels"])
+
+
+def test_an_encoder_without_weights_says_so_in_its_line(monkeypatch):
+    make_encoder = latency.make_encoder
+
+    def made(name):
+        if name == "dinov3":
+            raise MissingWeightsError("its weights are not here")
+        return make_encoder(name)
+
+    monkeypatch.setattr(latency, "make_encoder", made)
+    rows = list(latency.latency(["dinov3", "pixels"], [20], blocks=1, steps=1))
+    assert rows[0].missing == "its weights are not here"
+    assert rows[1].encoder == "pixels"
+
+
+def test_the_commit_is_not_that_of_somebody_elses_checkout(tmp_path, monkeypatch):
+    place = tmp_path / "site-packages" / "machine.py"
+    place.parent.mkdir()
+    place.touch()
+    git = ["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b"]
+    for words in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "theirs"]):
+        subprocess.run([*git, *words], check=True)
+    monkeypatch.setattr(machine, "__file__", str(place))
+    assert machine.describe([]).endswith(", commit unknown")
+    subprocess.run([*git, "add", "."], check=True)
+    assert re.search(r", commit [0-9a-f]{7,}\+$", machine.describe([]))
 
 
 def test_the_machine_in_one_line(monkeypatch):

@@ -6,6 +6,7 @@ import csv
 import functools
 import json
 import os
+import re
 import signal
 
 import numpy as np
@@ -233,6 +234,20 @@ def test_overrides(override, where, value):
     settings = make_settings(ENV, overrides=[override])
     assert where(settings) == value
     yaml.safe_dump(settings.hyperparams)
+
+
+@pytest.mark.parametrize(
+    ("steps", "changes", "every"),
+    [(60_000, [], 2_500), (6_000, [], 1_000), (5, [], 1), (60_000, ["eval_freq=700"], 700)],
+)
+def test_evaluations_come_as_often_in_runs_of_any_length(steps, changes, every, tmp_path):
+    settings = make_settings(ENV, steps=steps, overrides=changes)
+    assert settings.eval_every == every
+    settings.save(tmp_path / "config.yaml")
+    assert Settings.load(tmp_path / "config.yaml") == settings
+    text = (tmp_path / "config.yaml").read_text()
+    (tmp_path / "older.yaml").write_text(re.sub("eval_freq: .*\n", "", text))
+    assert Settings.load(tmp_path / "older.yaml").eval_freq is None
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Several runs on one page: which are of one method, and how sure the difference is."""
 
 import itertools
+import json
 import math
 import re
 
@@ -40,6 +41,15 @@ def runs(tmp_path):
         made_run.run(tmp_path / "b-2", films=False, solved=20, env=OTHER, bc_coef=0.0),
         made_run.run(tmp_path / "b-3", films=False, solved=2, env=OTHER, seed=1, bc_coef=0.0),
     ]
+
+
+def test_what_makes_no_steps_has_no_curve(runs, tmp_path):
+    for run in runs[4:]:
+        evaluation = json.loads((run / "evaluation.json").read_text())
+        (run / "evaluation.json").write_text(json.dumps({**evaluation, "frames": 0}))
+    page = write_comparison(runs, tmp_path / "c.html").read_text("utf-8")
+    assert page.count('class="spread"') == 1
+    assert re.findall(r"<b>(\d+) %</b>", page) == ["88", "43"]
 
 
 def test_methods_and_scores(runs, tmp_path, capsys):

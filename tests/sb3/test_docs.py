@@ -156,7 +156,7 @@ NOT_RUN = {
     r"regil convert IN OUT ": "a synopsis; test_convert.py",
     r"regil record ENV --teleop": "needs a window and a hand: test_teleoperation.py",
     r"regil train --preset paper ": "needs DINOv3's weights, a download: test_paper.py",
-    r"regil bench ranking": "no option makes it short: test_bench_rewards.py",
+    r"regil bench ranking": "no option makes it short: test_bench_ranking.py",
     r"regil bench faults --kills": "kills a run again and again: test_bench_faults.py",
 }
 # Tables that say what they would do (--dry-run), and why

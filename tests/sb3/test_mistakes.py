@@ -192,6 +192,7 @@ COMMANDS = [
     (setting("n_envs=0"), "n_envs"),
     (setting("frame_stack=0"), "frame_stack"),
     (setting("eval_episodes=0"), "eval_episodes"),
+    (setting("eval_freq=0"), "eval_freq"),
     (setting("env_kwargs.colour=red"), "colour"),
     (setting("env_kwargs.action_high=high"), "action_high"),
     # afterwards

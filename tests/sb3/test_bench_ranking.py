@@ -5,8 +5,8 @@ import pytest
 from regil_wrappers import Retriever
 from toy import demonstration
 
-from regil_sb3.bench import rewards, tables
-from regil_sb3.bench.rewards import EPISODES, REWARDS, Return
+from regil_sb3.bench import ranking, tables
+from regil_sb3.bench.ranking import EPISODES, REWARDS, Return
 
 
 def returns(reward, success, failure, still, goal=1):
@@ -21,7 +21,7 @@ def test_table_counts_the_goals_at_which_the_success_is_first():
         *returns("cos", (5, 1), (9, 0), (5, 0.5)),
         *returns("cos", (5, 1), (5, 0), (4, 0), goal=2),
     ]
-    lines = rewards.table(results)
+    lines = ranking.table(results)
     assert lines[0].startswith("Goals of 2 ")
     assert "| sdtw | 2 (1) | 2 (1) |" in lines
     assert "| cos | 0 (2) | 0 (2) |" in lines
@@ -32,8 +32,8 @@ def test_episodes_and_rewards_of_one_task(tmp_path, monkeypatch, capsys):
     def short(**_):
         return real(tasks=["drawer-close"], goals=1)
 
-    real = rewards.ranking
-    monkeypatch.setattr(rewards, "ranking", short)
+    real = ranking.ranking
+    monkeypatch.setattr(ranking, "ranking", short)
     monkeypatch.chdir(tmp_path)
     assert tables.main("ranking") == []
     out = capsys.readouterr().out
@@ -46,10 +46,10 @@ def test_episodes_and_rewards_of_one_task(tmp_path, monkeypatch, capsys):
 def test_rewards_of_an_exact_replay(name):
     demo = demonstration()
     retriever = Retriever(demo)
-    plain = rewards.episode_rewards(name, retriever, demo.frames)
+    plain = ranking.episode_rewards(name, retriever, demo.frames)
     assert plain.shape == (len(demo) - 1,)
     # where nothing has moved, registration changes nothing
-    registered = rewards.episode_rewards(name, retriever, demo.frames, demo.frames[0])
+    registered = ranking.episode_rewards(name, retriever, demo.frames, demo.frames[0])
     np.testing.assert_array_equal(plain, registered)
     if name == "sdtw":
         assert (plain == 0).all()

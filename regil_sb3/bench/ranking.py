@@ -20,19 +20,11 @@ from regil_wrappers.registration import moved_back, register
 from regil_wrappers.reward_signals import AT_EPISODE_END, make_signal
 
 import regil_sb3  # registers the environments  # noqa: F401
+from regil_sb3.bench.replay import TASKS
 from regil_sb3.recording import EVALUATION_SEEDS, record_expert
 
-__all__ = ["EPISODES", "REWARDS", "TASKS", "Return", "draw", "main", "ranking", "table"]
+__all__ = ["EPISODES", "REWARDS", "Return", "draw", "main", "ranking", "table"]
 
-TASKS = (
-    "button-press",
-    "door-open",
-    "drawer-close",
-    "drawer-open",
-    "hammer",
-    "window-close",
-    "window-open",
-)
 REWARDS = (
     ("sdtw", False),
     ("sdtw", True),
