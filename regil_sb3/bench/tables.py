@@ -189,24 +189,24 @@ def _compare(
 
 TABLES: dict[str, Callable[[], list[Row]]] = {"rendering": rendering, "retrieval": retrieval}
 """Tables by name."""
-_MODULES = (  # each has one of its name
-    "guide",
-    "success-buffer",
-    "sensitivity",
-    "buffer-vs-learning",
-    "trajectories",
-    "real-time",
-    "results",
-)
-_ROOMS = ("ranking", *_MODULES, "latency", "memory", "index", "throughput", "faults")
 FAULTS = ("kills", "disk", "files", "checkpoints", "pickles", "yaml", "archives", "numbers")
 """Parts of the table "faults", and the options that count them."""
-_OPTIONS = {
+_ROOMS: dict[str, tuple[str, ...] | None] = {
+    "ranking": (),
+    "guide": None,
+    "success-buffer": None,
+    "sensitivity": None,
+    "buffer-vs-learning": None,
+    "trajectories": None,
+    "real-time": None,
+    "results": None,
     "latency": ("encoders", "frames", "out"),
     "memory": ("frames", "dims", "plot"),
     "index": ("frames", "dims"),
+    "throughput": (),
     "faults": ("out", *FAULTS),
 }
+"""Modules by the names of their tables, and the options of each; None: all of its ``main``."""
 
 
 def _check_options(table: str, options: Iterable[str], known: Container[str]) -> None:
@@ -219,11 +219,8 @@ def main(table: str, **options: Any) -> list[Row]:
     """Measure a table and print it.
 
     Args:
-        table: one of `TABLES`; "guide", "success-buffer", "sensitivity", "buffer-vs-learning",
-            "trajectories", "real-time" or "results" (modules of their names); "ranking"
-            (`regil_sb3.bench.ranking`); "memory" or "index" (`regil_sb3.bench.memory`); "latency",
-            "throughput" or "faults" (modules of their names); or one of
-            `regil_sb3.bench.run_tables.LEARNING`.
+        table: one of `TABLES`; the name of a module here, as "success-buffer"; "index", of
+            `regil_sb3.bench.memory`; or one of `regil_sb3.bench.run_tables.LEARNING`.
         **options: the table's own.
 
     Returns:
@@ -232,47 +229,27 @@ def main(table: str, **options: Any) -> list[Row]:
     Raises:
         ValueError: where there is no such table, or it has no such option.
     """
-    if table in _MODULES:
-        module = import_module(f"regil_sb3.bench.{table.replace('-', '_')}")
-        _check_options(table, options, inspect.signature(module.main).parameters)
-        module.main(**options)
+    if table in _ROOMS:
+        room = "memory" if table == "index" else table
+        module = import_module(f"regil_sb3.bench.{room.replace('-', '_')}")
+        known = _ROOMS[table]
+        if known is None:
+            known = tuple(inspect.signature(module.main).parameters)
+        _check_options(table, options, known)
+        module.main(*[table] if room == "memory" else [], **options)
         return []
     from regil_sb3.bench import run_tables
 
     if table in run_tables.LEARNING:
-        known = set(inspect.signature(run_tables.planned).parameters)
-        known |= set(inspect.signature(run_tables.main).parameters)
-        _check_options(table, options, known - {"name", "root", "options"})
+        learning = {*inspect.signature(run_tables.planned).parameters}
+        learning |= {*inspect.signature(run_tables.main).parameters}
+        _check_options(table, options, learning - {"name", "root", "options"})
         run_tables.main(table, **options)
         return []
-    _check_options(table, options, _OPTIONS.get(table, ()))
-    if table == "latency":
-        from regil_sb3.bench import latency
-
-        latency.main(**options)
-        return []
-    if table in ("memory", "index"):
-        from regil_sb3.bench import memory
-
-        memory.main(table, **options)
-        return []
-    if table == "throughput":
-        from regil_sb3.bench import throughput
-
-        throughput.main()
-        return []
-    if table == "faults":
-        from regil_sb3.bench import faults
-
-        faults.main(**options)
-        return []
-    if table == "ranking":
-        from regil_sb3.bench import ranking
-
-        ranking.main()
-        return []
     if table not in TABLES:
-        raise ValueError(f"table {table!r} is not one of {', '.join([*TABLES, *_ROOMS])}")
+        known_tables = ", ".join([*TABLES, *_ROOMS, *run_tables.LEARNING])
+        raise ValueError(f"table {table!r} is not one of {known_tables}")
+    _check_options(table, options, ())
     rows = TABLES[table]()
     width = max(len(row.what) for row in rows)
     print(f"{table:{width}}  median ms  times the first")
