@@ -458,6 +458,22 @@ def test_a_hand_that_starts_elsewhere(demo: Demonstration, known: dict[str, Any]
     assert seen > successes(unseen, range(10))
 
 
+@pytest.mark.parametrize("settings", [{}, {"light": 0.7}, {"pan": (4.0, -3.0)}])
+def test_light_and_camera_do_not_move_the_hand(demo: Demonstration, settings: Any) -> None:
+    """Where the hand starts is asked of environments that say it starts elsewhere."""
+    home = toy_camera.project((0, 0, 0))[0]
+    still = guided(demo, "none", frozen=True, **settings)
+    still.reset(seed=0)
+    np.testing.assert_allclose(still.shift_at(home), (0, 0), atol=0.1)
+    for seed in range(4):
+        env = guided(demo, "none", frozen=True, start=2.0, **settings)
+        env.reset(seed=seed)
+        moved = toy_camera.project(env.unwrapped.hand)[0] - home
+        assert np.linalg.norm(moved) > 1
+        seen_at = home + np.array(settings.get("pan", (0, 0)))
+        np.testing.assert_allclose(env.shift_at(seen_at), moved, atol=0.8)
+
+
 def test_a_place_that_takes_several_steps_turns_the_hand_once(known: dict[str, Any]) -> None:
     """The hand is held up by a long way to go: its turn does not go on meanwhile."""
     actions = np.zeros((20, 7), np.float32)

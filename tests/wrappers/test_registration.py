@@ -13,6 +13,7 @@ from regil_wrappers.registration import (
     local_shift,
     moved_back,
     register,
+    shift_since,
 )
 
 SIZE = 84
@@ -187,7 +188,8 @@ def test_it_is_deterministic() -> None:
     ],
 )
 def test_pictures_that_do_not_compare(second: np.ndarray, shown: str) -> None:
-    for call in (register, lambda a, b: local_shift(a, b, np.zeros(2))):
+    points = (lambda a, b, find=find: find(a, b, np.zeros(2)) for find in (local_shift, shift_since))
+    for call in (register, *points):
         with pytest.raises(ValueError, match=shown):
             call(scene(), second)
 
@@ -250,3 +252,16 @@ def test_another_place_is_mostly_changed() -> None:
     near = register(scene(), scene(HOME + np.array([9, 5])))
     assert near is not None
     assert near.changed < 0.15
+
+
+@pytest.mark.parametrize("light", [0.7, 1.0, 1.2])
+@pytest.mark.parametrize("camera", [(0.0, 0.0), (3.0, -3.0), (-4.5, 1.5), (0.0, 6.2)])
+def test_light_and_camera_shift_nothing_round_a_point(
+    light: float, camera: tuple[float, float]
+) -> None:
+    for moved in ((0.0, 0.0), (3.4, -2.2), (5.0, 4.0)):
+        second = turned(camera, HOME + np.array(moved)) * light
+        second = second.round().clip(0, 255).astype(np.uint8)
+        point = HOME + np.array(camera) + np.array(moved) / 2
+        found = shift_since(scene(), second, point)
+        np.testing.assert_allclose(found, moved, atol=0.4 if any(moved) else 0.2)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from regil_wrappers.apart import Apart, arm_at_start, register_apart, round_point, taken_up
 from regil_wrappers.frames import FrameSource
 from regil_wrappers.matching import Point
-from regil_wrappers.registration import Displacement, local_shift, moved_back, register
+from regil_wrappers.registration import Displacement, moved_back, register, shift_since
 from regil_wrappers.retrieval import Retriever
 
 __all__ = ["Episode"]
@@ -149,9 +149,11 @@ class Episode:
     def shift_at(self, point: Point) -> Point:
         """How far what stands round a point (x, y) px has shifted since the demonstration began.
 
+        The point is as the camera sees it now; light, and a turn of the camera, are taken out.
+
         Raises:
             ValueError: before the first picture.
         """
         if self._first is None:
             raise ValueError("there is no picture yet: call reset() of the environment")
-        return local_shift(self.frames.recorded_first, self._first, point)
+        return shift_since(self.frames.recorded_first, self._first, point)

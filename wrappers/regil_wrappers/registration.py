@@ -4,6 +4,7 @@
 * ``register`` - finds it: what stood at p in one picture stands at centre + shift + growth * (p -
   centre) in the other
 * ``local_shift`` - the shift of what stands round one point, for pictures that follow each other
+* ``shift_since`` - the same for first pictures of two episodes
 * ``moved_back`` - a picture warped so that what moved stands where it stood
 
 A change of the light, and a camera that has turned a little, are taken out first
@@ -39,7 +40,7 @@ from regil_wrappers.matching import (
     warped,
 )
 
-__all__ = ["Displacement", "local_shift", "moved_back", "register"]
+__all__ = ["Displacement", "local_shift", "moved_back", "register", "shift_since"]
 
 _HULL_WEIGHT = 0.2  # of the unchanged pixels between changed ones
 _COARSE = 42  # side of the pictures of the coarse search
@@ -173,7 +174,31 @@ def local_shift(before: Picture, after: Picture, point: Point, radius: float = 8
         ValueError: if the pictures differ in shape or are not uint8 (H, W, 3).
     """
     check_pictures(before, after)
-    a, b = before.astype(np.float32), after.astype(np.float32)
+    return _shift_round(point, before.astype(np.float32), after.astype(np.float32), radius)
+
+
+def shift_since(reference: Picture, picture: Picture, point: Point, radius: float = 8.0) -> Point:
+    """How far what stands round a point has moved since another episode's first picture.
+
+    As `local_shift`, but a change of the light and a small turn of the camera are no movement.
+
+    Args:
+        reference: (H, W, 3) uint8, the first picture.
+        picture: (H, W, 3) uint8, the second.
+        point: (2,) px (x, y), as the camera of the second sees it.
+        radius: std of the Gaussian weights round the point, px at 84 pixels.
+
+    Returns:
+        (2,) px; 0 where nothing changed near the point.
+
+    Raises:
+        ValueError: if the pictures differ in shape or are not uint8 (H, W, 3).
+    """
+    pair = comparable(reference, picture)
+    return _shift_round(point, pair.a, pair.b, radius)
+
+
+def _shift_round(point: Point, a: Floats, b: Floats, radius: float) -> Point:
     unit = min(a.shape[:2]) / 84
     changed = (np.abs(a - b).max(axis=2) > DIFFERENT).astype(np.uint8)
     weights = cv2.dilate(changed, square(3, unit)) * _gaussian(a, point, radius * unit)
