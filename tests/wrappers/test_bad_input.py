@@ -191,6 +191,22 @@ def test_settings_of_one(
     refused(lambda: wrapper(ToyReach(), demo_path, **settings), message)
 
 
+@pytest.mark.parametrize("wrapper", [RetrievalGuideWrapper, RetrievalRewardWrapper])
+def test_resets_that_nobody_sees(demo_path: str, wrapper: Any) -> None:
+    inside = gym.wrappers.TimeLimit(gym.wrappers.Autoreset(ToyReach()), 20)
+    refused(lambda: wrapper(inside, demo_path), "put Autoreset outside this wrapper")
+    between = gym.wrappers.Autoreset(RetrievalGuideWrapper(ToyReach(), demo_path))
+    refused(lambda: wrapper(between, demo_path), "put Autoreset outside this wrapper")
+    env = gym.wrappers.Autoreset(wrapper(ToyReach(), demo_path))
+    env.reset(seed=0)
+    for _ in range(40):
+        *_, over, _ = env.step(np.zeros(2, np.float32))
+    assert over
+    info = env.step(np.zeros(2, np.float32))[-1]["retrieval"]
+    assert env.get_wrapper_attr("alignment").window == 1
+    assert info["cost"] == 0
+
+
 def test_before_the_first_reset(demo_path: str) -> None:
     env = RetrievalGuideWrapper(ToyReach(), demo_path)
     refused(env.guide_action, r"call reset\(\)")

@@ -188,7 +188,9 @@ def test_it_is_deterministic() -> None:
     ],
 )
 def test_pictures_that_do_not_compare(second: np.ndarray, shown: str) -> None:
-    points = (lambda a, b, find=find: find(a, b, np.zeros(2)) for find in (local_shift, shift_since))
+    points = (
+        lambda a, b, find=find: find(a, b, np.zeros(2)) for find in (local_shift, shift_since)
+    )
     for call in (register, *points):
         with pytest.raises(ValueError, match=shown):
             call(scene(), second)

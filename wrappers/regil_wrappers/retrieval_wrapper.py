@@ -198,12 +198,28 @@ def checked(
             f"{env!r} is no gymnasium.Env: regil_wrappers.vector has the same wrappers for vector "
             "environments"
         )
+    _check_resets(env)
     if env.has_wrapper_attr("retrieval_settings"):
         check_shared(settings, env.get_wrapper_attr("retrieval_settings"))
         return env.get_wrapper_attr("demonstrations"), None
     demos = demonstrations(settings["demo"])
     check_demonstrations(env, demos, settings)
     return demos, FrameSource(env, demos[0], labels_of(settings["demo"])[0], settings["image"])
+
+
+def _check_resets(env: gym.Env[Any, Any]) -> None:
+    """Refuse an environment that resets itself unseen: an alignment would go on over its episodes.
+
+    Raises:
+        ValueError: if `gymnasium.wrappers.Autoreset` is anywhere in it.
+    """
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.wrappers.Autoreset):
+            raise ValueError(
+                "gymnasium.wrappers.Autoreset is inside this wrapper, which would not see where "
+                "an episode begins: put Autoreset outside this wrapper"
+            )
+        env = env.env
 
 
 def check_shared(settings: dict[str, Any], inside: dict[str, Any]) -> None:
