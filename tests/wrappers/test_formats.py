@@ -338,6 +338,13 @@ def test_bad_options(options: dict[str, Any], message: str, tmp_path: Path) -> N
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["x.dat", "REACH.NPZ", "plain", "reach.npz"])
+def test_an_archive_of_any_name(name: str, tmp_path: Path) -> None:
+    formats.write(DEMO, tmp_path / name, "npz")
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    np.testing.assert_array_equal(formats.read(tmp_path / name).frames, DEMO.frames)
+
+
 def test_unknown_files_and_places(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(ValueError, match=r"no format that is known: regil .*; npz \(NumPy's"):

@@ -118,4 +118,5 @@ def write(demo: Demonstration, path: Path) -> None:
         arrays |= {_PREFIX + name: value for name, value in demo.observations.items()}
     else:
         arrays["observations"] = demo.observations
-    np.savez_compressed(path, **{k: v for k, v in arrays.items() if v is not None})
+    with path.open("wb") as file:  # to a path it would append ".npz"
+        np.savez_compressed(file, **{k: v for k, v in arrays.items() if v is not None})
