@@ -303,6 +303,30 @@ def test_a_calibration_from_other_pictures_is_refused(demo: Demonstration, known
     assert guided(demo, "none").calibration() is None
 
 
+@pytest.mark.parametrize(
+    ("made_with", "message"),
+    [
+        (
+            {"translation_dims": [1, 0, 2]},
+            r"of translation_dims=\[0, 1, 2\] and this guide has \[1, 0, 2\]",
+        ),
+        ({"gripper_dim": "none"}, "of gripper_dim=3 and this guide has None"),
+        ({"mirror": -1}, "of mirror=1 and this guide has -1"),
+    ],
+)
+def test_a_calibration_of_other_declarations_is_refused(
+    demo: Demonstration, known: dict[str, Any], made_with: dict[str, Any], message: str
+) -> None:
+    env = guided(demo, **made_with)
+    with pytest.raises(ValueError, match=message) as caught:
+        env.set_calibration(known)
+    assert "\n" not in str(caught.value)
+    assert env.calibration() is None
+    guided(demo, mirror="auto").set_calibration(known)
+    older = {name: value for name, value in known.items() if name != "gripper_dim"}
+    guided(demo).set_calibration(older)
+
+
 def test_disturbed_episodes_come_back(demo: Demonstration, known: dict[str, Any]) -> None:
     env = ready(demo, known, disturbance=3.0)
     differ, inside = [], []
@@ -480,7 +504,7 @@ def test_a_place_that_takes_several_steps_turns_the_hand_once(known: dict[str, A
     actions[:, 0], actions[:10, 4], actions[:, 6] = 1.0, 0.3, -1
     ones = np.ones(7, np.float32)
     servo = Servo((84, 84), actions, -ones, ones, gripper_dim=6, rotation_dims=[3, 4, 5])
-    servo.load_state(known)
+    servo.load_state({**known, "gripper_dim": 6})
     servo.reset(kind="corrected")
     servo.target_shift = np.array([0.0, 8.0, 0.0])
     turned, picture = np.zeros(3), np.zeros((84, 84, 3), np.uint8)
@@ -490,3 +514,25 @@ def test_a_place_that_takes_several_steps_turns_the_hand_once(known: dict[str, A
         turned += action[3:6]
         servo.executed(action, action, picture)
     assert turned == pytest.approx([0, 3, 0], abs=1e-5)
+
+
+def test_limits_that_differ_by_direction(known: dict[str, Any]) -> None:
+    """The hand goes as far as the environment lets it, and no farther than that is believed."""
+    low = np.array([-1, -0.2, -1, -1], np.float32)
+    high = np.array([0.4, 1, 1, 1], np.float32)
+    actions = np.array([[-1, 1, 0.5, -1]] * 6 + [[0.4, -0.2, -1, -1]] * 2, np.float32)
+    servo = Servo((84, 84), actions, low, high)
+    places = actions[:, :3].astype(float).cumsum(axis=0)
+    np.testing.assert_allclose(servo.demonstrated_path(), places, atol=1e-6)
+    servo.load_state(known)
+    servo.reset(kind="corrected")
+    hand, picture = np.zeros(3), np.zeros((84, 84, 3), np.uint8)
+    for expected in actions:
+        action = servo.action()
+        assert action is not None
+        np.testing.assert_allclose(action, expected, atol=1e-6)
+        hand += action[:3]
+        servo.executed(action, action, picture)
+        np.testing.assert_allclose(servo._hand, hand, atol=1e-6)
+    servo.executed(np.ones(4, np.float32), action, picture)  # clipped by the environment
+    np.testing.assert_allclose(servo._hand, hand + high[:3], atol=1e-6)

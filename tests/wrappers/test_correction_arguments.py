@@ -215,6 +215,35 @@ def test_actions_that_cannot_be_deltas(touch: Demonstration) -> None:
         )
 
 
+class Unbounded(ToyCamera):
+    """One dimension has no limits."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        high = np.ones(4, np.float32)
+        high[dim] = np.inf
+        self.action_space = gym.spaces.Box(-high, high)
+
+
+def test_actions_without_limits(touch: Demonstration) -> None:
+    for dim, named in ((1, r"translation_dims=\[0, 1, 2\]"), (3, "gripper_dim=3")):
+        message = rf"{named}: dimension {dim} takes \[-inf, inf\], and .*finite Box"
+        with pytest.raises(ValueError, match=message) as caught:
+            RetrievalGuideWrapper(Unbounded(dim), touch, correction="servo", gripper_dim=3)
+        assert "\n" not in str(caught.value)
+    # what the message says to do
+    bounded = gym.wrappers.TransformAction(
+        Unbounded(1), lambda action: action, gym.spaces.Box(-1, 1, (4,), np.float32)
+    )
+    env = RetrievalGuideWrapper(bounded, touch, correction="servo")
+    usual = RetrievalGuideWrapper(ToyCamera(), touch, correction="servo")
+    for a, b in zip(follow(env, 20), follow(usual, 20), strict=True):
+        np.testing.assert_array_equal(a["guide_action"], b["guide_action"])
+    # others need none
+    loose = RetrievalGuideWrapper(Unbounded(3), touch, correction="servo", gripper_dim="none")
+    assert all(np.isfinite(info["guide_action"]).all() for info in follow(loose, 100))
+
+
 def test_too_few_dimensions(demo_path: str) -> None:
     """Where nothing is declared it is said in one line, and plain replay goes on."""
     with pytest.warns(UserWarning, match=r"translation_dims=\[0, 1, 2\]: .*without corr") as said:

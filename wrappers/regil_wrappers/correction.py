@@ -75,7 +75,7 @@ class Servo:
         seed: of the choice between ways of replaying, and of disturbances.
 
     Raises:
-        ValueError: if a dimension does not exist or cannot be a delta.
+        ValueError: if a dimension does not exist, has no finite limits or cannot be a delta.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Servo:
     ) -> None:
         self._dims = checked_dims(translation_dims, low, high)
         self._plane = checked_plane(plane)
-        check_gripper(gripper_dim, self._dims, len(low))
+        check_gripper(gripper_dim, self._dims, low, high)
         if mirror not in ("auto", 1, -1):
             raise ValueError(f"mirror={mirror!r}: choose 'auto', 1 or -1")
         self._size = size
@@ -106,8 +106,9 @@ class Servo:
         self._gripper = gripper_dim
         self._disturbance = disturbance
         self._disturbs = False
-        self._limit = np.minimum(-low, high)[self._dims].astype(float)
-        deltas = np.clip(actions[:, self._dims].astype(float), -self._limit, self._limit)
+        self._least, self._most = (x[self._dims].astype(float) for x in (low, high))
+        self._full = np.minimum(-self._least, self._most)  # that both directions allow
+        deltas = self._clipped(actions[:, self._dims].astype(float))
         self._path = Path(deltas, None if gripper_dim is None else actions[:, gripper_dim])
         self._start_std = None if start_std is None else np.array(list(start_std), float)
         self._crowded = crowded
@@ -202,11 +203,11 @@ class Servo:
         if clean is None or not np.abs(self._kick).max() > 0:
             return None
         pushed: NDArray[np.float32] = clean.copy()
-        pushed[self._dims] = np.clip(self._kick, -self._limit, self._limit)
+        pushed[self._dims] = self._clipped(self._kick)
         return pushed
 
     def _next_kick(self) -> None:
-        self._kick = self._kick - np.clip(self._kick, -self._limit, self._limit)
+        self._kick = self._kick - self._clipped(self._kick)
         if self._disturbs and not self._kick.any() and self._rng.random() < 1 / _KICK_EVERY:
             way = self._rng.normal(size=3)
             size = self._disturbance * self._rng.uniform(0.5, 1)
@@ -233,7 +234,7 @@ class Servo:
         if self._way.kind == "plain":
             return None
         action: NDArray[np.float32] = self._actions[min(self._at, len(self._actions) - 1)].copy()
-        action[self._dims] = np.clip(self._target() - self._hand, -self._limit, self._limit)
+        action[self._dims] = self._clipped(self._target() - self._hand)
         action[self._rotations] = self._turns[min(self._at, len(self._turns) - 1)] - self._turned
         clipped: NDArray[np.float32] = np.clip(action, self._low, self._high)
         return clipped
@@ -257,7 +258,7 @@ class Servo:
             return
         if self._way.kind != "plain":
             delta = np.asarray(action, float)[self._dims]
-            self._hand = self._hand + np.clip(delta, -self._limit, self._limit)
+            self._hand = self._hand + self._clipped(delta)
             self._turned = self._turned + np.asarray(action, float)[self._rotations]
             self._at = self._next_place()
             self._next_kick()
@@ -275,7 +276,11 @@ class Servo:
         return self._at + (self._at >= len(self._path) and self._near(self._at))
 
     def _near(self, i: int) -> bool:
-        return bool((np.abs(self._place(i) - self._hand) <= _REACHED * self._limit).all())
+        return bool((np.abs(self._place(i) - self._hand) <= _REACHED * self._full).all())
+
+    def _clipped(self, deltas: Floats) -> Floats:
+        """(..., 3) action units: what the environment makes of these translations."""
+        return np.clip(deltas, self._least, self._most)
 
     def finish(self, success: bool) -> None:
         """The episode is over; what came of it counts where the guide chose every action."""
@@ -323,7 +328,8 @@ class Servo:
         """Take over what `state` gave, from a guide with the same demonstration and camera.
 
         Raises:
-            ValueError: if it is not such a state, or from pictures of another size.
+            ValueError: if it is not such a state, or from pictures of another size, other
+                dimensions or a mirror that was not declared.
         """
         try:
             cameras = [Pinhole.from_dict(values) for values in state["cameras"]]
@@ -334,6 +340,18 @@ class Servo:
         height, width = self._size
         if any(camera.size != self._size for camera in cameras):
             raise ValueError(f"the calibration is not from pictures of {height}x{width}")
+        for name, own in (("translation_dims", self._dims), ("gripper_dim", self._gripper)):
+            if state.get(name, own) != own:  # older ones do not say it
+                raise ValueError(
+                    f"the calibration is of {name}={state[name]} and this guide has {own}: "
+                    "remove it, or declare the same"
+                )
+        for camera in cameras:
+            if camera.mirror not in self._mirrors:
+                raise ValueError(
+                    f"the calibration is of mirror={camera.mirror} and this guide has "
+                    f"{self._mirrors[0]}: remove it, or declare the same"
+                )
         self.cameras = {camera.mirror: camera for camera in cameras}
         self._ways, self.why = ways, why
         self._calibration = None
