@@ -132,6 +132,13 @@ def test_actions_that_do_not_fit(demo_path: str, space: Any, message: str) -> No
     RetrievalRewardWrapper(with_space(space), demo_path)  # the reward plays none of them
 
 
+def shown(*shape: int, dtype: Any = np.uint8, key: str | None = None) -> ToyReach:
+    env = ToyReach()
+    space: gym.Space[Any] = gym.spaces.Box(0, 255, shape, dtype)
+    env.observation_space = space if key is None else gym.spaces.Dict({key: space})
+    return env
+
+
 @pytest.mark.parametrize(
     ("env", "image", "message"),
     [
@@ -151,6 +158,12 @@ def test_actions_that_do_not_fit(demo_path: str, space: Any, message: str) -> No
             "obs",
             r"\(48, 48, 9\), .*put frame stacking outside",
         ),
+        (shown(4, 48, 48, 3), "obs", r"\(4, 48, 48, 3\), .*put frame stacking outside"),
+        (shown(48, 48, 3, dtype=np.float32), "obs", r"float32 \(48, 48, 3\), .*convert .* uint8"),
+        (shown(48, 48, 1), "obs", r"uint8 \(48, 48, 1\), .*give three channels, RGB"),
+        (shown(48, 48, 4), "obs", r"uint8 \(48, 48, 4\), .*give three channels, RGB"),
+        (gym.wrappers.GrayscaleObservation(ToyReach()), "obs", "give three channels, RGB"),
+        (shown(48, 48, 3, dtype=np.float32, key="front"), "obs:front", "convert them to uint8"),
     ],
 )
 def test_no_picture(demo_path: str, env: Any, image: str, message: str) -> None:
@@ -225,6 +238,9 @@ def test_no_picture_from_render(demo: Demonstration) -> None:
     wrapped = RetrievalRewardWrapper(env, demo, image="render")
     env.render = lambda: None  # type: ignore[method-assign, assignment, return-value]
     refused(wrapped.reset, r"picture is NoneType \(\): it must be uint8")
+    for picture in (np.zeros((48, 48, 4), np.uint8), np.zeros((48, 48), np.uint8)):
+        env.render = lambda picture=picture: picture  # type: ignore[method-assign, misc]
+        refused(wrapped.reset, r"picture is uint8 \(48, 48.*\): it must be uint8 \(H, W, 3\), RGB")
 
 
 def test_a_demonstration_of_a_foreign_environment_is_only_compared_by_size_and_sight(

@@ -116,7 +116,8 @@ class FrameSource:
         if isinstance(space, gym.spaces.Dict):
             pictures = [name for name, inside in space.spaces.items() if _is_picture(inside)]
             self._key = image.removeprefix("obs:") if image.startswith("obs:") else None
-            if self._key not in pictures:
+            # Where there is no picture at all, it is said below why the one named is none
+            if self._key is None or self._key not in (pictures or space.spaces):
                 raise ValueError(
                     f"image={image!r} with dict observations: use one of "
                     f"{[f'obs:{name}' for name in pictures] + ['render']}"
@@ -127,11 +128,9 @@ class FrameSource:
                 f"image={image!r}: use 'obs' or 'render' ('obs:KEY' needs dict observations)"
             )
         if not _is_picture(space):
-            several = isinstance(space, gym.spaces.Box) and len(space.shape) == 3
             raise ValueError(
                 f"observations are {space.dtype} {space.shape}, not one RGB picture "
-                f"uint8 (H, W, 3): "
-                + ("put frame stacking outside this wrapper" if several else "use image='render'")
+                f"uint8 (H, W, 3): {_cure(space)}"
             )
         height, width, depth = cast("tuple[int, int, int]", space.shape)
         self._channels_first = depth != 3
@@ -207,14 +206,14 @@ class FrameSource:
             raw: what `raw` gave, of one environment.
 
         Raises:
-            ValueError: if the first picture has another size or is not the same way up.
+            ValueError: if it is no RGB picture, or the first one has another size or is not the
+                same way up.
         """
-        frame = raw
-        if self._channels_first:
-            frame = np.moveaxis(frame, 0, -1)
-        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3:
+        frame = np.moveaxis(raw, 0, -1) if self._channels_first else raw
+        rgb = np.shape(frame)[2:] == (3,)
+        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or not rgb:
             got = f"{getattr(frame, 'dtype', type(frame).__name__)} {np.shape(frame)}"
-            raise ValueError(f"the environment's picture is {got}: it must be uint8 (H, W, 3)")
+            raise ValueError(f"the environment's picture is {got}: it must be uint8 (H, W, 3), RGB")
         if not self._first_is_checked:
             recorded = self.recorded_first
             check_size(frame.shape[:2], recorded.shape[:2], self._label)
@@ -230,6 +229,19 @@ def _is_picture(space: gym.Space[Any]) -> bool:
         and len(space.shape) == 3
         and 3 in (space.shape[0], space.shape[2])
     )
+
+
+def _cure(space: gym.Space[Any]) -> str:
+    """What to do about observations that are no picture."""
+    shape = space.shape or ()
+    channels = min(shape[0], shape[2]) if len(shape) == 3 else 0
+    if len(shape) == 4 or (channels > 3 and channels % 3 == 0):
+        return "put frame stacking outside this wrapper"
+    if channels == 3:
+        return "convert them to uint8, 0 to 255, inside this wrapper, or use image='render'"
+    if channels or (len(shape) == 2 and space.dtype == np.uint8):
+        return "give three channels, RGB without alpha, or use image='render'"
+    return "use image='render'"
 
 
 def check_recorded_settings(env: Asked, metadata: dict[str, Any], label: str) -> None:
