@@ -10,7 +10,13 @@ import pytest
 import toy_env
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
-from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper, Retriever
+from regil_wrappers import (
+    Demonstration,
+    RetrievalGuideWrapper,
+    RetrievalRewardWrapper,
+    Retriever,
+    vector,
+)
 from regil_wrappers.rewards import demonstration_tau
 from toy_env import ToyReach
 
@@ -287,6 +293,24 @@ def test_as_many_frames_as_actions_repeats_the_last_action(demo: Demonstration) 
         _, _, terminated, _, _ = env.step(action)
     assert terminated
     np.testing.assert_array_equal(env.guide_action(), demo.actions[-1])
+
+
+def test_another_rate_than_recorded(demo: Demonstration) -> None:
+    """The toy takes 10 actions a second; a guide that replays at another speed is warned of."""
+    slow = Demonstration(demo.frames, demo.actions, metadata={"control_rate": 5})
+    with pytest.warns(UserWarning, match=r"recorded at 5 actions a second .* takes 10: ") as said:
+        RetrievalGuideWrapper(ToyReach(), slow)
+    assert len(said) == 1
+    assert said[0].filename == __file__
+    with pytest.warns(UserWarning, match="recorded at 5 actions a second") as said:
+        vector.RetrievalGuideWrapper(gym.vector.SyncVectorEnv([ToyReach] * 3), slow)
+    assert len(said) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        RetrievalRewardWrapper(ToyReach(), slow)
+        RetrievalGuideWrapper(ToyReach(says_settings=False), slow)
+        same = Demonstration(demo.frames, demo.actions, metadata={"control_rate": 10.0})
+        RetrievalGuideWrapper(ToyReach(), same)
 
 
 def test_patience_plays_on_from_the_furthest_frame(demo: Demonstration) -> None:

@@ -25,7 +25,7 @@ from regil_wrappers.demonstrations import demonstrations, labels_of
 from regil_wrappers.episode import Episode
 from regil_wrappers.frames import FrameSource
 from regil_wrappers.guide import Guide
-from regil_wrappers.guide_arguments import check_guide, fitting_actions, make_servo
+from regil_wrappers.guide_arguments import check_guide, fitting_actions, make_servo, warn_of_rate
 from regil_wrappers.latency import Latency
 from regil_wrappers.retrieval import step_together
 from regil_wrappers.retrieval_wrapper import (
@@ -189,14 +189,15 @@ class Guides:
         demos, frames = several.checked(settings)
         check_guide(guide_offset, guide_patience, correction, disturbance, len(demos))
         actions = fitting_actions(several.action_space, demos, settings["demo"])
+        told = several.metadata.get("regil") or {}
+        warn_of_rate(told, demos, settings["demo"])
         self.episodes = _episodes(several, demos, settings, frames)
         servos: list[Servo | None] = [None] * several.n
         if correction == "servo":
-            said = several.metadata.get("regil") or {}
             size = self.episodes.retriever.picture_size
             for i in range(several.n):
                 servos[i] = make_servo(
-                    said, several.action_space, size, actions[0], declared, disturbance
+                    told, several.action_space, size, actions[0], declared, disturbance
                 )
                 if servos[i] is None:  # it has said why, and the others would be no different
                     break

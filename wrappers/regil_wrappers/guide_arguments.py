@@ -15,7 +15,7 @@ from regil_wrappers.correction import Servo
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.demonstrations import labels_of, outlines
 
-__all__ = ["check_guide", "fitting_actions", "make_servo"]
+__all__ = ["check_guide", "fitting_actions", "make_servo", "warn_of_rate"]
 
 
 def check_guide(
@@ -87,6 +87,27 @@ def _fitting(
             f"environment takes [{low[a]:g}, {high[a]:g}]: record it in this environment"
         )
     return actions
+
+
+def warn_of_rate(said: dict[str, Any], demos: Sequence[Demonstration], given: Any) -> None:
+    """Warn of the first demonstration whose actions were executed at another rate.
+
+    Args:
+        said: ``metadata["regil"]`` of the environment.
+        demos: the demonstrations.
+        given: what ``demo=`` was, for the message.
+    """
+    here = said.get("control_rate")
+    for outline, label in zip(outlines(demos), labels_of(given), strict=True):
+        rate = outline.metadata["control_rate"]
+        if rate is not None and here is not None and not np.isclose(rate, here):
+            warnings.warn(
+                f"{label} was recorded at {rate:g} actions a second and the environment takes "
+                f"{here:g}: the guide's actions are made for another speed, so record it again "
+                f"or resample it (regil_wrappers.formats.read(..., fps={here:g}, actions=...))",
+                stacklevel=3,
+            )
+            return
 
 
 _DECLARED = {

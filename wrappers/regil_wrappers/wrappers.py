@@ -22,7 +22,7 @@ from regil_wrappers.correction import Servo
 from regil_wrappers.demonstrations import Demonstrations
 from regil_wrappers.encoders import Encoder
 from regil_wrappers.guide import Guide
-from regil_wrappers.guide_arguments import check_guide, fitting_actions, make_servo
+from regil_wrappers.guide_arguments import check_guide, fitting_actions, make_servo, warn_of_rate
 from regil_wrappers.memory import Search
 from regil_wrappers.retrieval_wrapper import RetrievalWrapper, checked, settings_of
 from regil_wrappers.reward_signals import AT_EPISODE_END, check_reward, make_signal
@@ -126,6 +126,8 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         loaded, frames = checked(env, settings)
         check_guide(guide_offset, guide_patience, correction, disturbance, len(loaded))
         actions = fitting_actions(env.action_space, loaded, settings["demo"])
+        said = env.unwrapped.metadata.get("regil") or {}
+        warn_of_rate(said, loaded, settings["demo"])
 
         gym.utils.RecordConstructorArgs.__init__(
             self,
@@ -152,7 +154,6 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
                 "plane": plane,
                 "mirror": mirror,
             }
-            said = env.unwrapped.metadata.get("regil") or {}
             size = self.retriever.picture_size
             self._servo = make_servo(
                 said, env.action_space, size, actions[0], declared, disturbance
