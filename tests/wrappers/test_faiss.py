@@ -104,6 +104,27 @@ def test_episodes_stepped_together_are_each_alone(
     assert latency.steps == 6
 
 
+class OneRow(Table):
+    """Gives the same array each time."""
+
+    def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+        if not hasattr(self, "row"):
+            self.row = np.empty((1, self.rows.shape[1]), np.float32)
+        self.row[:] = super().encode(frames)
+        return self.row
+
+
+def test_an_encoder_that_uses_its_array_again(
+    both: tuple[Retriever, Retriever, NDArray[np.float32]],
+) -> None:
+    _, near, rows = both
+    usual, reused = near.another(), near.another()
+    reused.encoder = OneRow(rows)
+    for start in (3 * LENGTH, 7 * LENGTH):  # from one demonstration to another
+        for frame in numbered(start + 20, 6).frames:
+            assert reused.step(frame) == usual.step(frame)
+
+
 def test_distances_to_all_frames_are_not_known(
     both: tuple[Retriever, Retriever, NDArray[np.float32]],
 ) -> None:

@@ -210,3 +210,25 @@ def test_an_infinite_distance_names_its_frame() -> None:
         pytest.raises(ValueError, match="frame 0 of the episode has no finite distance"),
     ):
         retriever.step(np.zeros((4, 4, 3), np.uint8))
+
+
+class OneBuffer:
+    """Gives the same array each time."""
+
+    def __init__(self) -> None:
+        self.row = np.empty((1, 1), np.float32)
+
+    def encode(self, frames: np.ndarray) -> np.ndarray:
+        self.row[:] = frames[0, 0, 0, 0] // 30
+        return self.row
+
+
+def test_an_encoder_that_uses_its_array_again() -> None:
+    demo = [1, 2, 3, 4, 5, 6]
+    retriever = Retriever(Demonstration(pictures(demo)), OneBuffer(), k=2, horizon=2)
+    np.testing.assert_array_equal(retriever.embeddings[:, 0], demo)
+    for i, picture in enumerate(pictures(demo)):
+        assert retriever.step(picture).end == i
+    seen = retriever.embedding
+    retriever.encoder.encode(pictures([8]))
+    np.testing.assert_array_equal(seen, [6])

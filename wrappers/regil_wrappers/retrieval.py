@@ -207,6 +207,7 @@ class Retriever:
             encode_s: how long encoding and distances took, in seconds, for ``latency``.
         """
         begun = perf_counter()
+        embedding = embedding.copy()  # the encoder may use its array again
         frames = self._window.take(embedding, self.k, distances)
         if frames is None:
             raise ValueError(

@@ -68,7 +68,7 @@ def _embed(encoder: Encoder, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
         for i in range(len(frames)):
             row = encoder.encode(frames[i : i + 1])
             check_embedding(row, f"frame {i} of the demonstration")
-            rows.append(row)
+            rows.append(row.copy())  # the encoder may use its array again
         embeddings = np.concatenate(rows)
     embeddings.flags.writeable = False
     return embeddings
