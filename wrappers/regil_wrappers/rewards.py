@@ -306,9 +306,13 @@ def demonstration_tau(
         tau > 0, in squared units of the embedding.
 
     Raises:
-        ValueError: if frames that far apart never differ.
+        ValueError: if there is only one frame, or frames that far apart never differ.
     """
     parts = [embeddings] if isinstance(embeddings, np.ndarray) else embeddings
+    if min(len(part) for part in parts) < 2:
+        raise ValueError(
+            "the demonstration has 1 frame, so the reward has no scale: record at least 2"
+        )
     gap = min(gap, min(len(part) for part in parts) - 1)
     d = np.array(
         [
