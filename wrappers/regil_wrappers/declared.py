@@ -76,9 +76,7 @@ def check_gripper(
     _check_finite(f"gripper_dim={gripper_dim}", gripper_dim, low, high)
 
 
-def _check_finite(
-    named: str, d: int, low: NDArray[np.float32], high: NDArray[np.float32]
-) -> None:
+def _check_finite(named: str, d: int, low: NDArray[np.float32], high: NDArray[np.float32]) -> None:
     if not np.isfinite([low[d], high[d]]).all():
         raise ValueError(
             f"{named}: dimension {d} takes [{low[d]:g}, {high[d]:g}], and correction='servo' needs "
