@@ -318,15 +318,24 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         """Hold still: no step is late until ``resume``."""
         with self._lock:
             self._paused, self._due = True, np.inf
-            self._arm.stop()
+            try:
+                self._arm.stop()
+            except RobotError as error:
+                self._stop(str(error))
 
     def resume(self) -> None:
-        """Go on after ``pause``."""
+        """Go on after ``pause``; an arm that a fault has stopped stays so until ``reset``."""
         with self._lock:
-            self._arm.recover()
+            self._watch()  # what went wrong since it last looked
             self._paused, self._rests = False, True
-            if self._steps >= 0 and self.fault is None:
-                self._target = self._arm.state().position.copy()
+            if self.fault is not None:
+                return
+            try:
+                self._arm.recover()
+                if self._steps >= 0:
+                    self._target = self._arm.state().position.copy()
+            except RobotError as error:
+                self._stop(str(error))
 
     def encoder_frame(self, size: int) -> npt.NDArray[np.uint8]:
         """The newest picture for an encoder that wants it larger, (size, size, 3) uint8.

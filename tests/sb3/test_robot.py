@@ -216,6 +216,59 @@ def test_an_operator_aborts_pauses_and_says_success():
     env.close()
 
 
+@pytest.mark.parametrize("at_once", [False, True])
+def test_an_abort_while_paused_leaves_the_arm_stopped_until_reset(at_once, monkeypatch):
+    class Aborting(Operator):
+        """Pauses, and aborts while paused; goes on ``at_once``, before the watchdog looks."""
+
+        looks = 0
+
+        def paused(self):
+            self.looks += self.hold
+            if self.looks > 1:
+                self.stop, self.hold = True, not at_once
+            return self.hold
+
+    operator = Aborting()
+    env = RehearsalEnv("reach", operator=operator)
+    env.reset(seed=0)
+    played(env, SIDEWAYS, 3)
+    recovered = []
+    recover = env.robot.arm.recover
+    monkeypatch.setattr(env.robot.arm, "recover", lambda: (recovered.append(1), recover()))
+    operator.hold = True
+    with pytest.warns(RuntimeWarning, match="operator: aborted"):
+        _, _, _, truncated, info = env.step(SIDEWAYS)
+    assert (truncated, info["fault"], recovered) == (True, "operator: aborted", [])
+    operator.hold = False
+    operator.looks = 0
+    env.reset(seed=0)
+    assert recovered
+    assert "fault" not in played(env, SIDEWAYS, 3)
+    env.close()
+
+
+@pytest.mark.parametrize("call", ["stop", "recover"])
+def test_an_arm_that_fails_at_a_pause_ends_the_episode(call, monkeypatch):
+    def failed():
+        raise RobotError("arm: it is in error")
+
+    env = RehearsalEnv("reach")
+    env.reset(seed=0)
+    played(env, SIDEWAYS, 3)
+    with monkeypatch.context() as patch:
+        patch.setattr(env.robot.arm, call, failed)
+        with pytest.warns(RuntimeWarning, match="the arm was stopped: arm: it is in error"):
+            env.pause()
+            env.resume()
+        _, _, _, truncated, info = env.step(SIDEWAYS)
+    assert truncated
+    assert info["fault"] == "arm: it is in error"
+    env.reset(seed=0)
+    assert "fault" not in played(env, SIDEWAYS, 3)
+    env.close()
+
+
 def test_a_late_step_stops_the_arm_in_real_time_and_homing_brings_it_back():
     env = RehearsalEnv("reach", real_time=True, patience=Patience(picture=30, state=30))
     env.reset(seed=0)
