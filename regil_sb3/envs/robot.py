@@ -301,16 +301,13 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         if self._gone:
             return
         self._gone = True
-        self._end_watch()
-        try:
-            self._arm.stop()
-        except RobotError as error:
-            warnings.warn(f"the arm was not told to stop: {error}", stacklevel=2)
-        self._arm.close()
-        self._camera.close()
-        if self._writer is not None:
-            self._end_episode("closed")
-            self._writer.close()
+        with contextlib.ExitStack() as rest:  # each of these, from the last, whatever fails
+            if self._writer is not None:
+                rest.callback(self._writer.close)
+                rest.callback(self._end_episode, "closed")
+            rest.callback(self._camera.close)
+            rest.callback(self._give_arm_back)
+            rest.callback(self._end_watch)
 
     # -- what ours call --------------------------------------------------------------------------
 
@@ -435,6 +432,15 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
                 return
             self.fault, self._due = why, np.inf
         warnings.warn(f"the arm was stopped: {why}", RuntimeWarning, stacklevel=2)
+
+    def _give_arm_back(self) -> None:
+        try:
+            try:
+                self._arm.stop()
+            finally:
+                self._arm.close()
+        except RobotError as error:
+            warnings.warn(f"the arm was not told to stop: {error}", stacklevel=2)
 
     def _require_no_fault(self) -> None:
         if self.fault is not None:

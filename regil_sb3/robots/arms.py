@@ -111,9 +111,11 @@ class FrankaArm:
 
     def close(self) -> None:
         """Stop, and let the robot go."""
-        self.stop()
-        self._ends = True
-        self._thread.join(2.0)
+        try:
+            self.stop()
+        finally:
+            self._ends = True
+            self._thread.join(2.0)
 
     def _grip(self, closed: bool) -> None:
         if closed:

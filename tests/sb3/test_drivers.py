@@ -8,8 +8,10 @@ import importlib.util
 import json
 import os
 import pty
+import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -88,6 +90,39 @@ def test_a_library_that_is_not_installed(library, make, said):
         pytest.skip(f"{library} is installed")
     with pytest.raises(ImportError, match=said):
         make()
+
+
+def test_a_franka_arm_that_is_gone_is_let_go_all_the_same(monkeypatch):
+    class Robot:
+        """What `FrankaArm` asks of franky's; its connection ends."""
+
+        is_in_control, has_errors, current_errors, lost = True, False, "", False
+
+        def __init__(self, *_, **__):
+            self.current_pose = SimpleNamespace(
+                end_effector_pose=SimpleNamespace(quaternion=None, translation=[0.4, 0.0, 0.3])
+            )
+
+        @property
+        def state(self):
+            return SimpleNamespace(time=time.monotonic())
+
+        def move(self, *_, **__):
+            if self.lost:
+                raise RuntimeError("UDP receive: timeout")
+
+    franky = SimpleNamespace(
+        Robot=Robot,
+        Gripper=lambda _: None,
+        RealtimeConfig=SimpleNamespace(Enforce=1, Ignore=0),
+        CartesianStopMotion=lambda: None,
+    )
+    monkeypatch.setitem(sys.modules, "franky", franky)
+    arm = FrankaArm("172.16.0.2")
+    arm._robot.lost = True
+    with pytest.raises(RobotError, match="arm: UDP receive: timeout"):
+        arm.close()
+    assert not arm._thread.is_alive()
 
 
 def test_an_operator_at_a_terminal():

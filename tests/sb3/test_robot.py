@@ -253,20 +253,54 @@ def test_an_arm_that_fails_at_a_pause_ends_the_episode(call, monkeypatch):
     def failed():
         raise RobotError("arm: it is in error")
 
+    def hold():
+        env.pause()
+        env.resume()
+
     env = RehearsalEnv("reach")
     env.reset(seed=0)
     played(env, SIDEWAYS, 3)
     with monkeypatch.context() as patch:
         patch.setattr(env.robot.arm, call, failed)
         with pytest.warns(RuntimeWarning, match="the arm was stopped: arm: it is in error"):
-            env.pause()
-            env.resume()
+            hold()
         _, _, _, truncated, info = env.step(SIDEWAYS)
     assert truncated
     assert info["fault"] == "arm: it is in error"
     env.reset(seed=0)
     assert "fault" not in played(env, SIDEWAYS, 3)
     env.close()
+
+
+def test_close_writes_the_open_episode_whatever_fails(tmp_path, monkeypatch):
+    def closed_with(owner, call, error):
+        env = RehearsalEnv("reach", record_to=str(tmp_path))
+        env.reset(seed=0)
+        played(env, SIDEWAYS, 3)
+
+        def failed():
+            raise error
+
+        with monkeypatch.context() as patch:
+            for name in ("stop", "close") if owner == "arm" else ("close",):
+                patch.setattr(getattr(env.robot, owner), name, failed)
+            call(env)
+        env.close()  # a second time does nothing
+        return env
+
+    def warned(env):
+        with pytest.warns(UserWarning, match="not told to stop: arm: it is gone"):
+            env.close()
+
+    def raised(env):
+        with pytest.raises(OSError, match="unplugged"):
+            env.close()
+
+    closed_with("arm", warned, RobotError("arm: it is gone")).robot.close()
+    closed_with("camera", raised, OSError("unplugged"))
+    written = [Demonstration.load(file) for file in sorted(tmp_path.glob("*.hdf5"))]
+    assert [len(demo.actions) for demo in written] == [3, 3]
+    assert all(demo.metadata["fault"] == "closed" for demo in written)
 
 
 def test_a_late_step_stops_the_arm_in_real_time_and_homing_brings_it_back():
