@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from regil_sb3.robots.interfaces import Picture, RobotError
+from regil_sb3.robots.interfaces import Picture, RobotError, first_line
 
 __all__ = ["GrabbingCamera", "OpenCVCamera", "RealSenseCamera"]
 
@@ -52,12 +52,13 @@ class GrabbingCamera:
         Raises:
             RobotError: it cannot be opened.
         """
-        if self._error is not None:
+        if self._error is not None or not self._thread.is_alive():
             self.close()
             try:
                 self._start()
-            except ValueError as error:
-                self._error = str(error)
+            except Exception as error:  # of whatever kind a driver's library raises
+                named = "" if isinstance(error, ValueError) else f"camera {self.name}: "
+                self._error = named + first_line(error)
                 raise RobotError(self._error) from None
 
     def close(self) -> None:
@@ -70,8 +71,8 @@ class GrabbingCamera:
         while not self._ends:
             try:
                 image = self._grab()
-            except (RuntimeError, OSError) as error:
-                self._error = f"camera {self.name}: {error}"
+            except Exception as error:  # see above
+                self._error = f"camera {self.name}: {first_line(error)}"
                 return
             self._picture = Picture(image, time.monotonic())
 

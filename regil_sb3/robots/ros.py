@@ -138,7 +138,8 @@ class RosCamera(GrabbingCamera):
             data, self._newest = self._newest, None
         if data is None:
             raise OSError(self._bridge.error or f"no picture for {_SILENCE:g} s")
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        # OpenCV raises an error of its own where there is nothing to decode
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
         if image is None:
             raise OSError("what it sends is neither JPEG nor PNG")
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8)

@@ -21,7 +21,7 @@ from websockets.sync.server import serve
 
 from regil_sb3.envs.robot import RobotEnv
 from regil_sb3.robots.arms import FrankaArm
-from regil_sb3.robots.cameras import OpenCVCamera, RealSenseCamera
+from regil_sb3.robots.cameras import GrabbingCamera, OpenCVCamera, RealSenseCamera
 from regil_sb3.robots.interfaces import RobotError
 from regil_sb3.robots.limits import Limits
 from regil_sb3.robots.operator import Keyboard
@@ -68,6 +68,49 @@ def test_a_camera_that_opencv_opens(film):
     camera.recover()
     picture = waited(lambda: camera._picture)  # a new one; by now the film may be over again
     assert picture.image.shape == (120, 160, 3)
+    camera.close()
+
+
+class FailingCamera(GrabbingCamera):
+    """Grabs until it is to fail; counts how often it was opened."""
+
+    opened, failure = 0, None
+
+    def _open(self):
+        self.opened += 1
+        if isinstance(self.failure, cv2.error):
+            raise self.failure
+
+    def _grab(self):
+        time.sleep(0.005)
+        if self.failure is not None:
+            raise self.failure
+        return CAMERA
+
+    def _release(self):
+        pass
+
+
+def test_a_camera_is_gone_whatever_its_library_raises():
+    camera = FailingCamera("fake", (160, 120), 30)
+    waited(camera.read)
+    camera.failure = cv2.error("OpenCV: (-215:Assertion failed) !buf.empty()\n> in imdecode")
+    waited(lambda: camera._error)
+    with pytest.raises(RobotError, match=r"^camera fake: OpenCV: .* !buf.empty\(\)$"):
+        camera.read()
+    with pytest.raises(RobotError, match=r"^camera fake: OpenCV: "):  # nor does it open again yet
+        camera.recover()
+    camera.failure = None
+    camera.recover()
+    assert waited(camera.read).image is CAMERA
+    opened = camera.opened
+    camera.recover()  # it works: nothing to do
+    assert camera.opened == opened
+    camera._ends = True  # its thread ends without a word
+    waited(lambda: not camera._thread.is_alive())
+    camera.recover()
+    assert camera.opened == opened + 1
+    assert waited(camera.read)
     camera.close()
 
 
@@ -248,9 +291,10 @@ def test_a_camera_of_ros(robot):
     camera.close()
     with pytest.raises(ValueError, match="gives 160x120 pictures, not 640x480"):
         RosCamera("/camera", robot.address)
-    robot.data = base64.b64encode(b"no picture").decode()
-    with pytest.raises(ValueError, match="gives no picture: what it sends is neither JPEG nor"):
-        RosCamera("/camera", robot.address)
+    for data in (b"no picture", b""):
+        robot.data = base64.b64encode(data).decode()
+        with pytest.raises(ValueError, match="gives no picture: what it sends is neither JPEG nor"):
+            RosCamera("/camera", robot.address)
 
 
 def test_an_arm_of_ros(robot):
