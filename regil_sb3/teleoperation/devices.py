@@ -302,6 +302,8 @@ class Axes:
         translation = list(said.get("translation_dims", range(min(3, n))))
         spare = [d for d in range(n) if d not in translation]
         gripper = said.get("gripper_dim", spare[-1] if len(spare) in (1, 4) else None)
+        if gripper == "none":  # a tool without one
+            gripper = None
         left = [d for d in spare if d != gripper]
         return cls(space.low, space.high, translation, left[:3] if len(left) >= 3 else [], gripper)
 

@@ -317,6 +317,10 @@ def test_which_dimensions_move():
     assert (axes(6).rotation, axes(6).gripper) == ([3, 4, 5], None)
     declared = axes(4, translation_dims=[1, 2, 3], gripper_dim=0)
     assert declared.action(np.array([1.0, 0, 0, 0, 0, 0]), False).tolist() == [-2, 2, 0, 0]
+    wipe = axes(6, gripper_dim="none")  # as robosuite's task declares it
+    assert (wipe.rotation, wipe.gripper) == ([3, 4, 5], None)
+    assert wipe.action(np.arange(6) / 5, True).tolist() == pytest.approx([0, 0.4, 0.8, 1.2, 1.6, 2])
+    assert axes(4, gripper_dim="none").gripper is None
     narrow = Axes.of(gym.spaces.Box(np.float32([0, -1]), np.float32([1, np.inf])), {})
     assert narrow.action(np.zeros(6), False).tolist() == [0.5, 0]
 
