@@ -103,6 +103,8 @@ class CheckpointCallback(BaseCallback):
         self._before: dict[int, Any] = {}  # signals' handlers of others
         self._saved_at = 0  # the step of the last checkpoint
         self._tried_at = 0  # the step at which the last one was to be saved
+        self._reached = 0  # the last step that was seen; a smaller one is of another learn()
+        self._began_anew = False  # learn() did, and no checkpoint is of it yet
         self._had_some = False  # whether there were checkpoints
         self._next = 0.0  # the time of the next one, on time.monotonic
         self._failed = ""
@@ -140,7 +142,7 @@ class CheckpointCallback(BaseCallback):
         if self.log is not None and state["log"] is not None:
             self.log.write_text(state["log"], encoding="utf-8")
         self._pending = state["logger"]
-        self._saved_at = self._tried_at = model.num_timesteps
+        self._saved_at = self._tried_at = self._reached = model.num_timesteps
         self._had_some = True
         return int(model.num_timesteps)
 
@@ -169,11 +171,14 @@ class CheckpointCallback(BaseCallback):
         finally:
             self._saving = False
         self._saved_at, self._had_some = self.num_timesteps, True
+        self._began_anew = False
 
     def _on_training_start(self) -> None:
         assert isinstance(self.model, TD3BC)
         check_can_be_kept(self.model)
         self._told = None
+        if self.num_timesteps < self._reached:
+            self._tried_at, self._began_anew = self.num_timesteps, True
         if self._pending:
             self.logger.name_to_value.update(self._pending[0])
             self.logger.name_to_count.update(self._pending[1])
@@ -185,9 +190,11 @@ class CheckpointCallback(BaseCallback):
                 self._before[number] = signal.signal(number, self._tell)
 
     def _on_rollout_start(self) -> None:
+        self._reached = self.num_timesteps
         if self._told is not None:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-            if self.num_timesteps != self._saved_at or not self.generations.numbers:
+            is_saved = self.num_timesteps == self._saved_at and not self._began_anew
+            if not is_saved or not self.generations.numbers:
                 self._save_or_warn()
             raise self._end(self._told)
         missing = not self.generations.numbers
@@ -199,7 +206,7 @@ class CheckpointCallback(BaseCallback):
                 stacklevel=2,
             )
             self._save_or_warn()
-        elif missing and not self._failed:
+        elif (missing or self._began_anew) and not self._failed:
             self._save_or_warn()
         elif self.steps is not None:
             if self.num_timesteps - self._tried_at >= self.steps:

@@ -198,6 +198,26 @@ def test_a_full_disk_is_named_and_training_goes_on(tmp_path, monkeypatch):
     assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 50
 
 
+def test_learning_again_from_step_0_is_saved_as_the_first_time(tmp_path):
+    model = new_model(toy())
+    checkpoints = CheckpointCallback(tmp_path, steps=25)
+    model.learn(110, checkpoints)
+    model.learn(60, checkpoints)
+    assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 50
+
+
+@pytest.mark.parametrize("steps", [None, 1000])
+def test_learning_again_is_saved_at_once(steps, tmp_path):
+    model = new_model(toy())
+    checkpoints = CheckpointCallback(tmp_path, steps=steps)
+    model.learn(40, checkpoints)
+    updates = model._n_updates
+    model.learn(30, checkpoints)
+    again = new_model(toy())
+    assert CheckpointCallback(tmp_path).restore(again) == 0
+    assert again._n_updates == updates > 0
+
+
 def test_what_takes_too_long_is_broken_off(tmp_path):
     class Hang(BaseCallback):
         def _on_step(self):
