@@ -27,6 +27,7 @@ from regil_sb3.relabelling import (
 )
 from regil_sb3.replay_buffer import FrameReplayBuffer
 from regil_sb3.td3bc import TD3BC
+from regil_sb3.vec_env import VecRetrievalGuide, VecRetrievalReward
 
 __all__ = ["check_can_be_kept", "learner_state", "load_learner_state"]
 
@@ -235,8 +236,14 @@ def _stacks(env: VecEnv) -> list[Any]:
     return [stacked] if subs is None else list(subs.values())
 
 
+def _retrieves_outside(env: VecEnv) -> bool:
+    """Whether alignments are kept outside the single environments, whose replay misses them."""
+    kinds = (VecRetrievalGuide, VecRetrievalReward)
+    return any(unwrap_vec_wrapper(env, kind) is not None for kind in kinds)
+
+
 def _environments_state(env: VecEnv) -> dict[str, Any]:
-    if env.has_attr("episode_state"):
+    if env.has_attr("episode_state") and not _retrieves_outside(env):
         return {
             "stacks": [s.stacked_obs for s in _stacks(env)],
             "open": env.env_method("episode_state"),
@@ -254,7 +261,8 @@ def _environments_state(env: VecEnv) -> dict[str, Any]:
 
 def _load_environments_state(env: VecEnv, state: dict[str, Any]) -> list[str]:
     env._reset_seeds()  # those of a new run
-    if state["open"] is not None and env.has_attr("go_back"):
+    outside = _retrieves_outside(env)
+    if state["open"] is not None and env.has_attr("go_back") and not outside:
         for stack, kept in zip(_stacks(env), state["stacks"], strict=True):
             stack.stacked_obs = kept
         why = [_replay(env, i, episode) for i, episode in enumerate(state["open"])]
@@ -272,6 +280,8 @@ def _load_environments_state(env: VecEnv, state: dict[str, Any]) -> list[str]:
         env.set_attr("np_random", fresh, indices=i)
         if lasting is not None:
             env.env_method("set_lasting_state", lasting, indices=i)
+    if outside:
+        return ["no episode inside VecRetrievalGuide or VecRetrievalReward can be done again"]
     return ["its environment is no ReplayableEpisode (regil_sb3.checkpoint.open_episode)"]
 
 

@@ -15,13 +15,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from toy import Reach
 
+from regil_sb3 import VecRetrievalGuide, VecRetrievalReward
 from regil_sb3.bench import toy as toy_module
-from regil_sb3.bench.toy import STEPS, flat, new_model, toy
+from regil_sb3.bench.toy import STEPS, demonstration, flat, new_model, toy
 from regil_sb3.checkpoint import (
     CheckpointCallback,
     Preempted,
@@ -127,6 +129,26 @@ def test_an_environment_that_is_not_deterministic_is_found_out(tmp_path):
     with pytest.warns(UserWarning, match="environment 0: its step 1 returned -"):
         done = CheckpointCallback(tmp_path).restore(model)
     model.learn(STEPS - done, reset_num_timesteps=False)
+
+
+def test_episodes_inside_vectorised_retrieval_are_truncated(tmp_path):
+    def made():
+        env = VecRetrievalReward(toy().venv, demo)
+        return VecFrameStack(VecRetrievalGuide(env, demo), 2)
+
+    demo = demonstration()
+
+    assert live(tmp_path, made(), 100, every=27) is None
+    model = new_model(made())
+    checkpoints = CheckpointCallback(tmp_path)
+    with pytest.warns(
+        UserWarning, match="as truncated: no episode inside VecRetrievalGuide or Vec"
+    ):
+        done = checkpoints.restore(model)
+    assert done == 81
+    model.learn(STEPS - done, checkpoints, reset_num_timesteps=False)
+    assert model.num_timesteps == STEPS
+    assert (model.replay_buffer.timeouts[done - 1] == 1).all()
 
 
 def test_another_model_is_refused(tmp_path):
