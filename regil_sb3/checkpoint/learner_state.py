@@ -149,7 +149,8 @@ def load_learner_state(model: TD3BC, state: dict[str, Any]) -> list[str]:
     np.random.set_state(generators["numpy"])
     th.set_rng_state(generators["torch"])
     if th.cuda.is_available() and generators["cuda"]:
-        th.cuda.set_rng_state_all(generators["cuda"])
+        # of the devices that there are; there may have been more
+        th.cuda.set_rng_state_all(generators["cuda"][: th.cuda.device_count()])
     model.action_space.np_random.bit_generator.state = generators["actions"]
     return lost
 

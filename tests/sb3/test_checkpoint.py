@@ -151,6 +151,19 @@ def test_episodes_inside_vectorised_retrieval_are_truncated(tmp_path):
     assert (model.replay_buffer.timeouts[done - 1] == 1).all()
 
 
+def test_on_fewer_devices_the_generators_that_there_are_come_back(tmp_path, monkeypatch):
+    checkpoints, again = CheckpointCallback(tmp_path), new_model(toy())
+    new_model(toy()).learn(5, checkpoints)
+    took = {}
+    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(th.cuda, "get_rng_state_all", lambda: [th.tensor([i]) for i in range(3)])
+    monkeypatch.setattr(th.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(th.cuda, "set_rng_state_all", lambda all: took.update(enumerate(all)))
+    checkpoints.save()
+    assert CheckpointCallback(tmp_path).restore(again) == 5
+    assert {i: state.item() for i, state in took.items()} == {0: 0, 1: 1}
+
+
 def test_another_model_is_refused(tmp_path):
     assert live(tmp_path, toy(), 50) is None
     other = new_model(toy(), buffer_size=151)
