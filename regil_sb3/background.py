@@ -59,7 +59,8 @@ class BackgroundTD3BC(TD3BC):
     The robot is paused while the updates by behaviour cloning run at the end of the warm-up. Runs
     are not reproducible: how far the learner is when an action is chosen depends on the machine.
 
-    Arguments, and what is saved, are those of `TD3BC`.
+    Arguments, and what is saved, are those of `TD3BC`. A checkpoint is saved between two updates,
+    the robot paused, and holds what is still owed, too.
 
     Example:
         >>> from regil_sb3.background import BackgroundTD3BC
@@ -70,6 +71,7 @@ class BackgroundTD3BC(TD3BC):
     _acting: Any = None
     _learner: threading.Thread | None = None
     _own_logger: Logger | None = None
+    _owed = 0  # updates
 
     @property
     def logger(self) -> Logger:
@@ -93,10 +95,10 @@ class BackgroundTD3BC(TD3BC):
             Exception: whatever the learner's thread died of.
         """
         self._inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
-        self._owed = 0  # updates
         self._failure: BaseException | None = None
         self._turn = threading.Condition()
-        self._ends = False
+        self._ends = self._busy = False
+        self._held = True  # until learn is set up: a checkpoint may have left updates owed
         self._own_logger = Logger(None, [])
         self._copies = [copy.deepcopy(self.policy) for _ in range(2)]
         self._acting = self._copies[0]
@@ -123,6 +125,7 @@ class BackgroundTD3BC(TD3BC):
                     self._ends = True
                     self._turn.notify_all()
                 self._learner.join()
+            self._owed = 0  # a learner that failed left some
             sys.setswitchinterval(interval)
             self._learner = self._acting = None
             self._copies = []
@@ -144,6 +147,7 @@ class BackgroundTD3BC(TD3BC):
         due = self._number_of_updates(gradient_steps)
         with self._turn:
             self._owed += due
+            self._held = False
             self._turn.notify_all()
         self._raise_failure()
         if not self.pretrained and not self.in_warmup and self.num_timesteps >= self.warmup_steps:
@@ -153,6 +157,30 @@ class BackgroundTD3BC(TD3BC):
                 self._turn.notify_all()
                 self._turn.wait_for(lambda: self.pretrained or self._failure is not None)
             self._raise_failure()
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """The learner rests between two updates and all transitions are in the replay buffer.
+
+        Robots are paused meanwhile. For the thread that called `learn`; elsewhen nothing is to do.
+
+        Raises:
+            Exception: whatever the learner's thread died of.
+        """
+        if self._learner is None:
+            yield
+            return
+        assert self.env is not None
+        with paused(self.env), self._turn:
+            self._held = True
+            try:
+                self._turn.wait_for(lambda: not self._busy)
+                self._raise_failure()
+                self._empty_inbox()
+                yield
+            finally:
+                self._held = False
+                self._turn.notify_all()
 
     def dump_logs(self) -> None:
         """Write log data, the learner's too."""
@@ -199,12 +227,18 @@ class BackgroundTD3BC(TD3BC):
                 self._turn.notify_all()
         finally:
             self._empty_inbox()
+            with self._turn:
+                self._busy = False
+                self._turn.notify_all()
 
     def _wait_for_work(self) -> bool:
         """Whether there is an update to do; False when `learn` is over and all are done."""
         with self._turn:
-            self._turn.wait_for(lambda: self._owed > 0 or self._ends)
-            return self._owed > 0
+            self._busy = False
+            self._turn.notify_all()
+            self._turn.wait_for(lambda: (self._owed > 0 and not self._held) or self._ends)
+            self._busy = self._owed > 0
+            return self._busy
 
     def _empty_inbox(self) -> None:
         assert self.replay_buffer is not None
@@ -221,7 +255,7 @@ class BackgroundTD3BC(TD3BC):
 
     def _excluded_save_params(self) -> list[str]:
         ours = ("_acting", "_learner", "_own_logger", "_inbox", "_turn", "_copies", "_failure")
-        return [*super()._excluded_save_params(), *ours]
+        return [*super()._excluded_save_params(), *ours, "_owed"]
 
 
 class _Inbox:

@@ -9,6 +9,7 @@ A checkpoint executes nothing when it is read: it is JSON and arrays
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import threading
@@ -22,6 +23,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 
 from regil_sb3 import __version__
+from regil_sb3.background import BackgroundTD3BC
 from regil_sb3.checkpoint.generations import Generations
 from regil_sb3.checkpoint.learner_state import check_can_be_kept, learner_state, load_learner_state
 from regil_sb3.td3bc import TD3BC
@@ -153,14 +155,19 @@ class CheckpointCallback(BaseCallback):
             OSError: it could not be written; the earlier ones are as they were.
             FloatingPointError: a parameter is not finite; likewise.
         """
-        assert isinstance(self.model, TD3BC)
-        require_finite_parameters(self.model)
+        model = self.model
+        assert isinstance(model, TD3BC)
+        with model.held() if isinstance(model, BackgroundTD3BC) else contextlib.nullcontext():
+            self._save(model)
+
+    def _save(self, model: TD3BC) -> None:
+        require_finite_parameters(model)
         has_log = self.log is not None and self.log.exists()
         self._saving = True
         try:
             self.generations.save(
                 {
-                    "learner": learner_state(self.model),
+                    "learner": learner_state(model),
                     "logger": [
                         dict(self.logger.name_to_value),
                         dict(self.logger.name_to_count),

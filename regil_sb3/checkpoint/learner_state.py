@@ -42,6 +42,7 @@ _COUNTERS = (
     "_last_obs",
     "_last_episode_starts",
     "soft_q",  # ROT's
+    "_owed",  # BackgroundTD3BC's
 )
 _OF_SB3 = (
     ReplayBuffer,

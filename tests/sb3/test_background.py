@@ -3,24 +3,42 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import numpy as np
 import pytest
 import toy_env
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from regil_sb3 import TD3BC
 from regil_sb3.background import BackgroundTD3BC
+from regil_sb3.checkpoint import CheckpointCallback, ReplayableEpisode, callback
+from regil_sb3.checkpoint.learner_state import learner_state
 
 
-def made(demo, pauses=None, **arguments):
+class At(BaseCallback):
+    """Does something at a step."""
+
+    def __init__(self, step, what):
+        super().__init__()
+        self.step, self.what = step, what
+
+    def _on_step(self):
+        if self.num_timesteps == self.step:
+            self.what()
+        return True
+
+
+def made(demo, pauses=None, replayable=False, **arguments):
     def make():
         env = toy_env.ToyReach()
         if pauses is not None:
             env.pause = lambda: pauses.append("pause")
             env.resume = lambda: pauses.append("resume")
-        return RetrievalRewardWrapper(RetrievalGuideWrapper(env, demo=demo), demo=demo)
+        env = RetrievalRewardWrapper(RetrievalGuideWrapper(env, demo=demo), demo=demo)
+        return ReplayableEpisode(env) if replayable else env
 
     settings = {
         "warmup_steps": 60,
@@ -83,7 +101,71 @@ def test_collecting_does_not_wait_for_updates(demo, monkeypatch):
     assert model._n_updates == 30
 
 
-def test_a_failure_of_the_learner_ends_learning(demo, monkeypatch):
+def slow(monkeypatch):
+    """Updates that take longer than steps; whether one is under way."""
+    pays, under_way = TD3BC.train, threading.Event()
+
+    def train(self, *arguments):
+        under_way.set()
+        time.sleep(0.05)
+        pays(self, *arguments)
+        under_way.clear()
+
+    monkeypatch.setattr(TD3BC, "train", train)
+    return under_way
+
+
+def test_a_checkpoint_is_whole_while_it_learns(demo, tmp_path, monkeypatch):
+    owed, pauses, under_way = [], [], slow(monkeypatch)
+
+    def state(model):
+        assert pauses[-1] == "pause"
+        assert model.replay_buffer.total == model.num_timesteps
+        assert model._n_updates + model._owed == max(0, model.num_timesteps - 20) // 2
+        owed.append(model._owed)
+        time.sleep(0.05)
+        assert not under_way.is_set()
+        return learner_state(model)
+
+    monkeypatch.setattr(callback, "learner_state", state)
+    model = made(demo, pauses, warmup_steps=1000, replayable=True)
+    model.learn(100, CheckpointCallback(tmp_path, steps=10))
+    assert len(owed) == 10
+    assert max(owed) > 0  # it was saved in the middle of its work
+    assert model._n_updates == 40
+
+
+def test_going_on_it_does_the_updates_that_were_owed(demo, tmp_path, monkeypatch):
+    def stop():
+        raise KeyboardInterrupt
+
+    slow(monkeypatch)
+    checkpoints = CheckpointCallback(tmp_path, steps=10)
+    model = made(demo, replayable=True)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(100, [checkpoints, At(93, stop)])
+    assert model._owed == 0
+    again = made(demo, replayable=True)
+    assert CheckpointCallback(tmp_path).restore(again) == 90
+    assert again._owed > 0
+    assert again._n_updates + again._owed == 35
+    again.learn(30, reset_num_timesteps=False)
+    assert again._n_updates == 50
+    assert again.replay_buffer.total == 120
+    assert again._owed == 0
+
+
+def test_a_failure_of_the_learner_ends_a_save(demo, tmp_path, monkeypatch):
+    def broken(self, *_):
+        raise FloatingPointError("critic loss is nan")
+
+    monkeypatch.setattr(TD3BC, "_require_finite", broken)
+    with pytest.raises(FloatingPointError, match="critic loss is nan"):
+        made(demo).learn(5_000, CheckpointCallback(tmp_path, steps=1))
+    assert CheckpointCallback(tmp_path).generations.numbers
+
+
+def test_a_failure_of_the_learner_ends_learning_ends_learning(demo, monkeypatch):
     def broken(self, *_):
         raise FloatingPointError("critic loss is nan")
 
