@@ -53,13 +53,18 @@ _MADE = {
     "gymnasium.spaces.multi_binary": {"MultiBinary"},
     "gymnasium.spaces.multi_discrete": {"MultiDiscrete"},
     "regil_sb3.bc_schedule": {"BySuccess"},
-    "stable_baselines3.common.noise": {"NormalActionNoise", "OrnsteinUhlenbeckActionNoise"},
+    "stable_baselines3.common.noise": {
+        "NormalActionNoise",
+        "OrnsteinUhlenbeckActionNoise",
+        "VectorizedActionNoise",
+    },
     "stable_baselines3.common.type_aliases": {"TrainFreq"},
     "stable_baselines3.common.utils": {"ConstantSchedule", "FloatSchedule", "LinearSchedule"},
 }
 """What it may make an empty one of, and then fill."""
 
 _NAMED = {
+    "numpy": {"float32"},  # the dtype of action noise
     "numpy.random._mt19937": {"MT19937"},
     "numpy.random._pcg64": {"PCG64"},
     "numpy.random.bit_generator": {"SeedSequence"},

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import os
+import pickle
 import zipfile
 
 import numpy as np
 import pytest
+from stable_baselines3.common.noise import NormalActionNoise
 from test_td3bc import small
 from toy import demonstration, stacked
 
@@ -73,6 +75,28 @@ def test_own_models_need_no_trust(tmp_path, policy):
     assert loaded.num_timesteps == 30
     with (tmp_path / "model.zip").open("rb") as file:
         assert TD3BC.load(file).num_timesteps == 30
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_action_noise_needs_no_trust(tmp_path, n_envs):
+    noise = NormalActionNoise(np.zeros(2), np.array([0.1, 0.2]))
+    model = small(stacked(n_envs), action_noise=noise)
+    model.learn(30)
+    model.save(tmp_path / "model")
+    loaded = TD3BC.load(tmp_path / "model", env=stacked(n_envs), demo=demonstration())
+    drawn = []
+    for one in (model, loaded):
+        np.random.seed(0)
+        drawn.append(one.action_noise())
+    assert drawn[1].shape == ((2,) if n_envs == 1 else (2, 2))
+    assert np.array_equal(*drawn)
+    loaded.learn(4, reset_num_timesteps=False)
+
+
+def test_a_number_type_is_named_and_not_called(saved, tmp_path):
+    path = with_pickle(saved, tmp_path / "model.zip", pickle.dumps(Call(np.float32, 1)))
+    with pytest.raises(ValueError, match=r"a call of <class 'numpy\.float32'>"):
+        TD3BC.load(path)
 
 
 def test_damaged_files_are_refused_in_one_line(saved, tmp_path):
