@@ -23,7 +23,8 @@ def as_seen(
 
     Args:
         demo: with T actions.
-        observation_space: of the policy; images are channels first and ``n_stack`` frames deep.
+        observation_space: of the policy; images are channels first and ``n_stack`` frames deep. Of
+            a dict, the one picture that ``demo.observations`` lack is what the frames show.
         action_space: of the environment.
         n_stack: frames that an image observation stacks.
 
@@ -80,11 +81,15 @@ def _channels_first(values: npt.NDArray[Any], space: spaces.Space[Any]) -> npt.N
 def _observations(demo: Demonstration, space: spaces.Space[Any], n_stack: int) -> Observations:
     assert demo.actions is not None
     n = len(demo.actions)
-    if isinstance(space, spaces.Dict) and isinstance(demo.observations, dict):
-        missing = sorted(set(space.keys()) - set(demo.observations))
-        if missing:
+    if isinstance(space, spaces.Dict):
+        held = dict(demo.observations) if isinstance(demo.observations, dict) else {}
+        missing = sorted(set(space.keys()) - set(held))
+        if len(missing) == 1 and is_image_space(space[missing[0]]):
+            held[missing.pop()] = demo.frames  # a recorder keeps this picture there alone
+        if not missing:
+            return {key: _channels_first(held[key][:n], one) for key, one in space.items()}
+        if held:
             raise ValueError(f"the demonstration's observations lack {', '.join(missing)}")
-        return {key: _channels_first(demo.observations[key][:n], one) for key, one in space.items()}
     if isinstance(demo.observations, np.ndarray) and not is_image_space(space):
         return demo.observations[:n]
     if not is_image_space(space):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from copy import deepcopy
 from importlib.metadata import version
 from typing import Any
 
@@ -120,9 +121,9 @@ def check_seeds(seed: int, many: int = 1) -> None:
 class Recorder:
     """Takes down one episode of an environment, one after the other.
 
-    Pictures are the observations; of dict observations the one that is a picture; else the
-    environment's ``encoder_frame`` in its ``image_size``, or what it renders. Observations that are
-    no pictures are kept beside them.
+    Pictures are the observations; of dict observations the first that is a picture; else the
+    environment's ``encoder_frame`` in its ``image_size``, or what it renders. All other
+    observations are kept beside them, further pictures included.
 
     Args:
         env: without retrieval wrappers.
@@ -189,11 +190,11 @@ class Recorder:
             frame = observation
         elif self._keys:
             frame = observation[self._keys[0]]
-            observation = {k: v for k, v in observation.items() if k not in self._keys}
+            observation = {k: v for k, v in observation.items() if k != self._keys[0]}
         else:
             frame = self.drawn()
         if not self._pixels:
-            self._observations.append(observation)
+            self._observations.append(deepcopy(observation))  # it may be written to again
         self.frames.append(np.array(frame))
         if self._encoder_size is not None:
             self._encoder_frames.append(self._ours.encoder_frame(self._encoder_size))

@@ -4,8 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from regil_wrappers.demonstration import Demonstration
+from stable_baselines3.common.vec_env import DummyVecEnv, VecTransposeImage
 
-from regil_sb3.recording import EVALUATION_SEEDS, record_expert
+from regil_sb3.as_seen import as_seen
+from regil_sb3.recording import EVALUATION_SEEDS, Recorder, record_expert
 
 BUTTON = "regil/metaworld-button-press-v0"
 
@@ -98,6 +100,67 @@ def test_state_is_kept_beside_pictures_of_it():
     pixels = record_expert(BUTTON, env_kwargs={"size": 32})
     assert demo.observations.shape == (len(demo), 39)
     assert np.array_equal(demo.frames, pixels.frames)
+
+
+class TwoCameras(Patient):
+    """Its observations are written into the same arrays at every step."""
+
+    observation_space = gym.spaces.Dict(
+        {
+            "front": Patient.observation_space,
+            "state": gym.spaces.Box(0, 9, (1,), np.float32),
+            "wrist": Patient.observation_space,
+        }
+    )
+    held = {name: space.sample() for name, space in observation_space.items()}  # noqa: RUF012
+
+    def seen(self, frame):
+        self.held["front"][:], self.held["wrist"][:] = frame, frame + 100
+        self.held["state"][:] = self.now
+        return self.held
+
+    def reset(self, *, seed=None, options=None):
+        frame, info = super().reset(seed=seed)
+        return self.seen(frame), info
+
+    def step(self, action):
+        frame, *rest = super().step(action)
+        return self.seen(frame), *rest
+
+
+def test_every_camera_is_kept_and_cloned(tmp_path):
+    recorder = Recorder(TwoCameras())
+    recorder.begin(3)
+    while not recorder.over:
+        recorder.step(np.zeros(2, np.float32))
+    recorder.demonstration("TwoCameras-v0").save(tmp_path / "demo.hdf5")
+    demo = Demonstration.load(tmp_path / "demo.hdf5")
+    assert demo.frames[:, 0, 0, 0].tolist() == [0, 1, 2, 3]
+    assert sorted(demo.observations) == ["state", "wrist"]
+    assert demo.observations["wrist"][:, 0, 0, 0].tolist() == [100, 101, 102, 103]
+
+    space = VecTransposeImage(DummyVecEnv([TwoCameras])).observation_space
+    seen, actions = as_seen(demo, space, TwoCameras.action_space, 1)
+    assert {k: v.shape for k, v in seen.items()} == {k: (3, *v.shape) for k, v in space.items()}
+    assert seen["front"][:, 0, 0, 0].tolist() == [0, 1, 2]
+    assert seen["wrist"][:, 0, 0, 0].tolist() == [100, 101, 102]
+    assert seen["state"][:, 0].tolist() == [0, 1, 2]
+    assert actions.shape == (3, 2)
+
+
+def test_frames_are_one_picture_and_no_more():
+    """Of one that is the only observation; not of two, nor of what is no picture."""
+    frames = np.zeros((3, 8, 8, 3), np.uint8)
+    demo = Demonstration(frames, actions=np.zeros((2, 2), np.float32))
+    front, state, wrist = TwoCameras.observation_space.spaces.values()
+    seen, _ = as_seen(demo, gym.spaces.Dict(front=front), TwoCameras.action_space, 1)
+    assert np.array_equal(seen["front"], frames[:2])
+    with_state = Demonstration(frames, demo.actions, {"x": np.zeros((3, 1), np.float32)})
+    both = gym.spaces.Dict(x=state, front=front, wrist=wrist)
+    with pytest.raises(ValueError, match="lack front, wrist"):
+        as_seen(with_state, both, TwoCameras.action_space, 1)
+    with pytest.raises(ValueError, match="lack state"):
+        as_seen(with_state, gym.spaces.Dict(x=state, state=state), TwoCameras.action_space, 1)
 
 
 def test_environment_without_an_expert_gets_one_line():
