@@ -116,13 +116,14 @@ def evaluate(
             f"evaluation needs one environment and an episode, not {env.num_envs} and {episodes}"
         )
     result = Evaluation()
+    shows = is_image_space(env.observation_space)
     for episode in range(episodes):
         env.seed(first_seed + episode)
-        obs = env.reset()
+        obs: Any = env.reset()
         total, length, success, done = 0.0, 0, False, False
         while not done:
-            if episode == 0:
-                result.first_frames += _frames(obs, env)
+            if episode == 0 and shows:
+                result.first_frames.append(_newest_frame(obs[0], env))
             action = act(obs, env, length == 0)
             if episode == 0 and isinstance(env.action_space, spaces.Box):
                 space = env.action_space  # float32 may put a bound outside by its last bit
@@ -131,8 +132,8 @@ def evaluate(
             obs, rewards, dones, infos = env.step(action)
             total, length, done = total + float(rewards[0]), length + 1, bool(dones[0])
             success |= bool(infos[0].get("is_success", False))
-        if episode == 0:
-            result.first_frames += _frames(infos[0]["terminal_observation"][None], env)
+        if episode == 0 and shows:
+            result.first_frames.append(_newest_frame(infos[0]["terminal_observation"], env))
         result.successes.append(success)
         result.returns.append(total)
         result.lengths.append(length)
@@ -141,11 +142,10 @@ def evaluate(
     return result
 
 
-def _frames(obs: Any, env: VecEnv) -> list[npt.NDArray[np.uint8]]:
-    """The newest RGB frame of a (stacked) image observation; nothing for other observations."""
+def _newest_frame(observation: Any, env: VecEnv) -> npt.NDArray[np.uint8]:
+    """The newest RGB frame (H, W, 3) of one (stacked) image observation."""
     space = env.observation_space
-    if not (isinstance(space, spaces.Box) and is_image_space(space)):
-        return []
+    assert isinstance(space, spaces.Box)
     if is_image_space_channels_first(space):
-        return [obs[0, -3:].transpose(1, 2, 0).copy()]
-    return [obs[0, ..., -3:].copy()]
+        return np.array(observation[-3:].transpose(1, 2, 0), np.uint8)
+    return np.array(observation[..., -3:], np.uint8)

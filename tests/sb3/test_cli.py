@@ -315,6 +315,25 @@ def test_upside_down_demonstration_is_refused_before_the_run_begins(demo, tmp_pa
     assert not (folder / "config.yaml").exists()
 
 
+def test_dict_observations_from_recording_to_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "BC_UPDATES", 3)
+    demo, run = tmp_path / "demo.hdf5", tmp_path / "run"
+    assert main(["record", "ToyReach-v0", "-o", str(demo), "--env-kwargs", "obs=dict"]) == 0
+    words = ["train", "--env", "ToyReach-v0", "--demo", str(demo), "--out", str(run)]
+    changes = {
+        **{"env_kwargs.obs": "dict", "image": "obs:front", "policy": "MultiInputPolicy"},
+        **{"policy_kwargs": "{}", "frame_stack": 1, "n_steps": 1, "correction": "none"},
+        **{"register": "false", "disturbance": 0, "warmup_steps": 25, "learning_starts": 10},
+        **{"bc_pretrain_steps": 2, "buffer_size": 200, "batch_size": 4, "eval_episodes": 1},
+    }
+    for key, value in changes.items():
+        words += ["--set", f"{key}={value}"]
+    assert main([*words, "--steps", "60", "--episodes", "1"]) == 0
+    assert any(row["eval/success_rate"] for row in rows(run))
+    assert {"policy", "guide", "bc"} <= set(json.loads((run / "evaluation.json").read_text()))
+    assert not (run / "episode.hdf5").exists()  # pictures are not all that the policy saw
+
+
 def test_missing_demonstration_names_what_to_do(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["train", "--env", "Pendulum-v1"]) == 2
