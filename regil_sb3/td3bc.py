@@ -86,7 +86,8 @@ class TD3BC(SafeLoad, TD3):
         policy_delay: critic updates for one actor update.
         target_policy_noise: std of the target's smoothing noise.
         target_noise_clip: its limit.
-        warmup_steps: steps in which the guide acts. An episode begun in warm-up is finished in it.
+        warmup_steps: steps in which the guide acts. An episode begun in warm-up is finished in it;
+            environments that are done before others go on with the guide until all are.
         guide_again: share of the episodes after the warm-up that the guide acts in, from beginning
             to end, as long as the policy succeeds less often than the guide did.
         bc_coef: lambda at the start; 0 for no BC term.
@@ -411,13 +412,15 @@ class TD3BC(SafeLoad, TD3):
         self._check_finite(reward, new_obs)
         before = self._last_obs
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        # The policy is trained by the BC term only when all environments are through the warm-up
+        waits = bool((self._collection.warmup & ~dones).any())
         for i, info in enumerate(infos):
             self._collection.step(i, before, buffer_action[i], float(reward[i]), info)
             if dones[i]:
-                self._end_episode(i)
+                self._end_episode(i, waits)
         self._in_step = False
 
-    def _end_episode(self, env: int) -> None:
+    def _end_episode(self, env: int, waits: bool) -> None:
         episodes = self._collection
         success = bool(episodes.succeeded[env])
         if not episodes.guided[env]:
@@ -438,7 +441,7 @@ class TD3BC(SafeLoad, TD3):
             del self._returns[name][: -self._stats_window_size]
         behind = self.guide_again > 0 and self._by_success.behind_guide
         again = behind and np.random.random() < self.guide_again
-        episodes.begin(env, self.num_timesteps < self.warmup_steps, again)
+        episodes.begin(env, self.num_timesteps < self.warmup_steps, again or waits)
 
     def _check_finite(self, reward: npt.NDArray[Any], new_obs: Any) -> None:
         values = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}

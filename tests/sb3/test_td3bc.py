@@ -86,6 +86,23 @@ def test_guide_acts_until_the_episode_begun_in_warmup_has_ended():
     assert not guided[last + 1 :].any()
 
 
+@pytest.mark.parametrize("n_envs", [1, 2, 8])
+def test_no_policy_acts_before_its_bc_updates(n_envs):
+    model = small(stacked(n_envs), warmup_steps=100)
+    acted = []
+
+    def note(*_):
+        acted.append((model.pretrained, model._collection.guided.copy()))
+        return True
+
+    model.learn(400, callback=note)
+    before = np.array([guided for pretrained, guided in acted if not pretrained])
+    after = np.array([guided for pretrained, guided in acted if pretrained])
+    assert before.all()
+    assert len(before) * n_envs <= 100 + n_envs * Reach.LENGTH, "no warm-up without end"
+    assert not after[Reach.LENGTH :].any()
+
+
 def test_success_buffer_takes_whole_successful_guided_episodes():
     demo = demonstration()
     model = small(stacked(n_envs=3))
