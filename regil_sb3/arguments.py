@@ -53,6 +53,11 @@ def check_arguments(given: dict[str, Any]) -> None:
         check_number(name, given[name], kinds, least, most)
     if given["reward_scale"] != "auto":
         check_number("reward_scale", given["reward_scale"], _NUMBER, 0.0, np.inf)
+    elif given["gamma"] == 1:
+        raise ValueError(
+            "gamma=1 with reward_scale='auto', which is 10 * (1 - gamma), makes every reward 0: "
+            "set reward_scale to a number"
+        )
     if given["bc_steps"] is not None:
         check_number("bc_steps", given["bc_steps"], (int,), 1, np.inf)
     if not callable(given["learning_rate"]):

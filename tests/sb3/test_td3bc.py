@@ -215,6 +215,7 @@ def test_reward_scale_comes_from_the_environment(monkeypatch):
     assert model.used_reward_scale == pytest.approx(0.25 * 10 * (1 - 0.99))
     assert set(np.unique(model.replay_buffer.rewards[:50])) == {-1.0}  # kept raw
     assert small(stacked(), reward_scale=3.0).learn(30).used_reward_scale == 3.0
+    assert small(stacked(), reward_scale=0.5, gamma=1.0).learn(30).used_reward_scale == 0.5
 
 
 def test_nan_reward_stops_with_step_and_cause():
@@ -370,6 +371,7 @@ def test_subprocesses_and_dict_observations():
         ({"bc_coef": -1}, "bc_coef is -1"),
         ({"bc_std": 0}, "bc_std is 0"),
         ({"gamma": 1.5}, "at most 1"),
+        ({"gamma": 1}, "makes every reward 0: set reward_scale"),
         ({"warmup_steps": "many"}, "warmup_steps is 'many'"),
         ({"reward_scale": "automatic"}, "reward_scale is 'automatic'"),
         ({"policy_kwargs": {"share_features_extractor": True}}, "shared_encoder"),
