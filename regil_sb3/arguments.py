@@ -62,19 +62,27 @@ def check_arguments(given: dict[str, Any]) -> None:
         check_number("bc_steps", given["bc_steps"], (int,), 1, np.inf)
     if not callable(given["learning_rate"]):
         check_number("learning_rate", given["learning_rate"], _NUMBER, 0.0, np.inf)
-    _check_train_freq(given["train_freq"])
+    unit = _check_train_freq(given["train_freq"])
+    if unit != "step" and isinstance(given["gradient_steps"], float):
+        raise ValueError(
+            f"gradient_steps={given['gradient_steps']} counts updates per transition, and "
+            f"train_freq={given['train_freq']} episodes: make gradient_steps a whole number (-1: "
+            "one update a step), or train_freq one of steps"
+        )
     check_device(given["device"])
     if given["q_coef"] == 0 and given["bc_coef"] == 0:
         raise ValueError("q_coef=0 and bc_coef=0 leave the actor nothing to learn from")
 
 
-def _check_train_freq(train_freq: Any) -> None:
+def _check_train_freq(train_freq: Any) -> str:
+    """The unit that it counts in."""
     unit = "step"
     if isinstance(train_freq, tuple | list) and len(train_freq) == 2:
         train_freq, unit = train_freq
     check_number("train_freq", train_freq, (int,), 1, np.inf)
     if unit not in ("step", "episode"):
         raise ValueError(f"train_freq counts in {unit!r}: use 'step' or 'episode'")
+    return unit
 
 
 def check_device(device: Any) -> None:

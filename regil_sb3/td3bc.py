@@ -23,7 +23,6 @@ from stable_baselines3.common.type_aliases import (
     MaybeCallback,
     Schedule,
     TrainFreq,
-    TrainFrequencyUnit,
 )
 from stable_baselines3.common.utils import polyak_update, safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
@@ -76,7 +75,8 @@ class TD3BC(SafeLoad, TD3):
         gamma: discount factor.
         train_freq: environment steps (of all environments at once) between updates.
         gradient_steps: updates each time; a float is updates per *transition*, all environments
-            counted: 0.5 makes one update for every two transitions.
+            counted: 0.5 makes one update for every two transitions; it needs a ``train_freq`` in
+            steps.
         action_noise: SB3's own; replaces ``exploration_std``.
         replay_buffer_class: None chooses ``FrameReplayBuffer`` for images, else SB3's; their twins
             of ``regil_sb3.relabelling`` where rewards come at the episode's end.
@@ -546,8 +546,6 @@ class TD3BC(SafeLoad, TD3):
         if not isinstance(gradient_steps, float):
             return gradient_steps
         assert isinstance(self.train_freq, TrainFreq)
-        if self.train_freq.unit != TrainFrequencyUnit.STEP:
-            raise ValueError("a fractional gradient_steps needs a train_freq counted in steps")
         self._updates_due += gradient_steps * self.train_freq.frequency * self.n_envs
         whole = int(self._updates_due)
         self._updates_due -= whole

@@ -200,6 +200,12 @@ def test_one_update_for_every_two_transitions(n_envs):
     assert abs(model._n_updates - (96 - 16) / 2) <= n_envs
 
 
+def test_as_many_updates_as_the_episode_has_steps():
+    model = small(stacked(), train_freq=(1, "episode"), gradient_steps=-1, learning_starts=0)
+    model.learn(60)
+    assert model._n_updates == model.num_timesteps
+
+
 def test_bc_learns_the_demonstration():
     model = small(stacked(), policy_kwargs={"random_shift": 0})
     model.set_logger(Logger(None, []))
@@ -372,6 +378,8 @@ def test_subprocesses_and_dict_observations():
         ({"bc_std": 0}, "bc_std is 0"),
         ({"gamma": 1.5}, "at most 1"),
         ({"gamma": 1}, "makes every reward 0: set reward_scale"),
+        ({"train_freq": (1, "episode")}, r"gradient_steps=0\.5 counts .* train_freq=\(1, 'ep"),
+        ({"train_freq": (1, "epoch")}, "use 'step' or 'episode'"),
         ({"warmup_steps": "many"}, "warmup_steps is 'many'"),
         ({"reward_scale": "automatic"}, "reward_scale is 'automatic'"),
         ({"policy_kwargs": {"share_features_extractor": True}}, "shared_encoder"),
