@@ -2,6 +2,9 @@
 
 SB3's ``ReplayBuffer`` keeps every stacked observation and its successor: 2 x n_stack frames a
 transition. Here each frame is stored once, and stacks are put together when a batch is sampled.
+
+* ``FrameReplayBuffer`` - it; ``frame_bytes`` - what it keeps of one observation
+* ``truncate_newest`` - what ``FrameReplayBuffer.close_episodes`` is, for one of SB3's buffers
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import numpy.typing as npt
 import psutil
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import BaseBuffer
+from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -252,3 +255,11 @@ class FrameReplayBuffer(BaseBuffer):
             self.dones[pos, env] = self.timeouts[pos, env] = 1
             self.ends[pos, int(env)] = self.frames[self.total % self.n_frames, env].copy()
         self._age[:] = 0
+
+
+def truncate_newest(buffer: ReplayBuffer) -> None:
+    """End what is open in one of SB3's buffers: the newest transitions are the last of theirs."""
+    if buffer.full or buffer.pos:
+        newest = (buffer.pos - 1) % buffer.buffer_size
+        open_ones = buffer.dones[newest] == 0
+        buffer.dones[newest][open_ones] = buffer.timeouts[newest][open_ones] = 1

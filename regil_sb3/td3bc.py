@@ -37,7 +37,7 @@ from regil_sb3.guided import guide_actions
 from regil_sb3.model_file import SafeLoad
 from regil_sb3.policies import ImagePolicy
 from regil_sb3.relabelling import EpisodeRewards, episode_reward_class, rewards_come_late
-from regil_sb3.replay_buffer import FrameReplayBuffer
+from regil_sb3.replay_buffer import FrameReplayBuffer, truncate_newest
 from regil_sb3.success_buffer import SuccessBuffer
 
 SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
@@ -351,6 +351,8 @@ class TD3BC(SafeLoad, TD3):
             self._collection.restart(self.num_timesteps < self.warmup_steps)
             if isinstance(self.replay_buffer, FrameReplayBuffer):
                 self.replay_buffer.close_episodes()
+            elif isinstance(self.replay_buffer, ReplayBuffer):
+                truncate_newest(self.replay_buffer)
         return result
 
     @property

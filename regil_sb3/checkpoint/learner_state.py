@@ -25,7 +25,7 @@ from regil_sb3.relabelling import (
     EpisodeRewardReplayBuffer,
     EpisodeRewards,
 )
-from regil_sb3.replay_buffer import FrameReplayBuffer
+from regil_sb3.replay_buffer import FrameReplayBuffer, truncate_newest
 from regil_sb3.td3bc import TD3BC
 from regil_sb3.vec_env import VecRetrievalGuide, VecRetrievalReward
 
@@ -142,7 +142,7 @@ def load_learner_state(model: TD3BC, state: dict[str, Any]) -> list[str]:
     if lost:
         model._last_obs = None  # so learn() resets the environments and closes the episodes
         if isinstance(model.replay_buffer, ReplayBuffer):
-            _truncate_newest(model.replay_buffer)
+            truncate_newest(model.replay_buffer)
         if isinstance(model.replay_buffer, EpisodeRewards):
             model.replay_buffer.forget_open_episodes()
     generators = state["generators"]
@@ -215,14 +215,6 @@ def _load_replay_state(buffer: Any, state: dict[str, Any]) -> None:
                     into[: len(kept)] = kept
     if isinstance(buffer, EpisodeRewards):
         buffer._open, buffer.scale = state["open"], state["scale"]
-
-
-def _truncate_newest(buffer: ReplayBuffer) -> None:
-    """End what is open in one of SB3's buffers: the newest transitions are the last of theirs."""
-    if buffer.full or buffer.pos:
-        newest = (buffer.pos - 1) % buffer.buffer_size
-        open_ones = buffer.dones[newest] == 0
-        buffer.dones[newest][open_ones] = buffer.timeouts[newest][open_ones] = 1
 
 
 # -- environments --------------------------------------------------------------------------------

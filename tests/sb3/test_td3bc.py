@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from regil_wrappers import Demonstration
 from stable_baselines3 import TD3
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 from toy import Reach, demonstration, stacked
@@ -280,6 +281,27 @@ def test_learning_again_in_the_middle_of_an_episode(reset):
     first = [e.observations[0] for e in model.success_buffer._episodes]
     dots = [np.flatnonzero(f.any(axis=(0, 1)))[0] for f in first]
     assert max(dots) <= 12, "every kept episode starts where episodes start"
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_returns_do_not_reach_over_a_reset(n_steps):
+    settings = {**TD3_OWN, **OFF, "n_steps": n_steps}
+    model = TD3BC("MlpPolicy", make_vec_env("Pendulum-v1", 2), **settings)
+    model.learn(60)
+    model.learn(60)  # resets both in the middle of an episode
+    buffer = model.replay_buffer
+    state = np.random.get_state()
+    for last in (29, 28):
+        np.random.set_state(state)
+        drawn = np.random.randint(0, 2, size=8)
+        np.random.set_state(state)
+        batch = buffer._get_samples(np.full(8, last))
+        steps = min(30 - last, n_steps)
+        expected = sum(0.99**i * buffer.rewards[last + i, drawn] for i in range(steps))
+        np.testing.assert_allclose(batch.rewards[:, 0], expected, rtol=1e-5)
+        reached = buffer.next_observations[last + steps - 1, drawn]
+        assert np.array_equal(batch.next_observations, reached)
+        assert not batch.dones.any(), "truncated, and no end to learn from"
 
 
 def test_going_on_after_a_callback_stopped_in_a_step():
