@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from io import BufferedIOBase
 from os import PathLike
+from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
+from zipfile import BadZipFile
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +21,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     MaybeCallback,
@@ -695,6 +699,53 @@ class TD3BC(SafeLoad, TD3):
             )
         finally:  # Stable-Baselines3 tells callbacks of the end only where no error was raised
             _close(callback)
+
+    # -- the replay buffer on disk ---------------------------------------------------------------
+
+    def save_replay_buffer(self, path: str | Path | BufferedIOBase) -> None:
+        """Save the replay buffer: a ``FrameReplayBuffer`` as plain arrays, SB3's as SB3 does.
+
+        ``regil_sb3.checkpoint.CheckpointCallback`` keeps all else that a run needs to go on, too.
+
+        Args:
+            path: the file (".npz", for SB3's ".pkl", is added where it has no suffix), or an open
+                one.
+        """
+        if not isinstance(self.replay_buffer, FrameReplayBuffer):
+            super().save_replay_buffer(path)
+            return
+        file = open_path(path, "w", self.verbose, "npz")
+        np.savez(file, **self.replay_buffer.state())
+        if file is not path:
+            file.close()
+
+    def load_replay_buffer(
+        self, path: str | Path | BufferedIOBase, truncate_last_traj: bool = True
+    ) -> None:
+        """Load what `save_replay_buffer` saved; plain arrays run no code, SB3's pickles may.
+
+        Args:
+            path: the file, or an open one.
+            truncate_last_traj: of a ``FrameReplayBuffer``, whether ``learn`` begins with a new
+                episode; False goes on in the open one, where nothing was done since it was saved.
+
+        Raises:
+            ValueError: of a ``FrameReplayBuffer``, the file is no such buffer, or of another size.
+            OSError: it cannot be read.
+        """
+        if not isinstance(self.replay_buffer, FrameReplayBuffer):
+            super().load_replay_buffer(path, truncate_last_traj)
+            return
+        file = open_path(path, "r", self.verbose, "npz")
+        try:
+            self.replay_buffer.load_state(dict(np.load(file, allow_pickle=False)))
+        except (ValueError, TypeError, KeyError, EOFError, BadZipFile) as error:
+            raise ValueError(f"{path} is no replay buffer for this model: {error}") from error
+        finally:
+            if file is not path:
+                file.close()
+        if truncate_last_traj:
+            self._last_obs = None
 
     def _excluded_save_params(self) -> list[str]:
         return [

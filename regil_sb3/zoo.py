@@ -142,7 +142,7 @@ class Experiment(ExperimentManager):
         """Save the model, and with ``--save-replay-buffer`` what it needs to go on."""
         keeps = self.save_replay_buffer
         if isinstance(getattr(model, "replay_buffer", None), FrameReplayBuffer):
-            self.save_replay_buffer = False  # a pickle, which it could not load
+            self.save_replay_buffer = False  # it is kept below
         super().save_trained_model(model)
         if keeps and isinstance(model, TD3BC):
             for name, buffer in _buffers(model).items():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -281,6 +284,64 @@ def test_learning_again_in_the_middle_of_an_episode(reset):
     first = [e.observations[0] for e in model.success_buffer._episodes]
     dots = [np.flatnonzero(f.any(axis=(0, 1)))[0] for f in first]
     assert max(dots) <= 12, "every kept episode starts where episodes start"
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("name", ["buffer", "buffer.pkl", None])
+def test_replay_buffer_of_frames_is_saved_and_loaded(n_envs, name, tmp_path):
+    model = small(stacked(n_envs), buffer_size=200)
+    model.learn(62)  # an episode is open
+    file = io.BytesIO() if name is None else tmp_path / name
+    model.save_replay_buffer(file)
+    saved = {key: value.copy() for key, value in model.replay_buffer.state().items()}
+    if name is None:
+        file.seek(0)
+    other = small(stacked(n_envs), buffer_size=200)
+    other.load_replay_buffer(file)
+    loaded = other.replay_buffer.state()
+    assert loaded.keys() == saved.keys()
+    assert all(np.array_equal(loaded[key], saved[key]) for key in saved)
+    assert other.replay_buffer.total == 62 // n_envs
+    other.learn(30)
+    assert other.replay_buffer.dones[62 // n_envs - 1].all(), "the open episodes have ended"
+
+
+def test_replay_buffer_goes_back_in_the_model_that_went_on(tmp_path):
+    model = small(stacked())
+    model.learn(62)
+    model.save_replay_buffer(tmp_path / "buffer.npz")
+    model.learn(7, reset_num_timesteps=False)
+    model.load_replay_buffer(tmp_path / "buffer.npz")
+    assert model.replay_buffer.total == 62
+    model.learn(30, reset_num_timesteps=False)
+    assert model.replay_buffer.total == 92
+    assert model.replay_buffer.dones[61] == 1
+
+
+def test_replay_buffer_of_sb3_is_saved_and_loaded(tmp_path):
+    model = TD3BC("MlpPolicy", "Pendulum-v1", **TD3_OWN, **OFF).learn(30)
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = TD3BC("MlpPolicy", "Pendulum-v1", **TD3_OWN, **OFF)
+    other.load_replay_buffer(tmp_path / "buffer")
+    assert np.array_equal(other.replay_buffer.rewards, model.replay_buffer.rewards)
+
+
+def test_what_is_no_replay_buffer_gets_one_line(tmp_path):
+    model, path = small(stacked(), buffer_size=50), tmp_path / "buffer.npz"
+    small(stacked(), buffer_size=200).save_replay_buffer(path)
+    whole = path.read_bytes()
+    arrays = io.BytesIO()
+    np.save(arrays, np.zeros(3))
+    for content in (b"", b"text", whole[:200], arrays.getvalue(), pickle.dumps({"total": 3})):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"buffer\.npz is no replay buffer") as refused:
+            model.load_replay_buffer(path)
+        assert "\n" not in str(refused.value)
+    small(stacked(2), buffer_size=50).save_replay_buffer(path)
+    with pytest.raises(ValueError, match="does not fit one of"):
+        model.load_replay_buffer(path)
+    with pytest.raises(FileNotFoundError):
+        model.load_replay_buffer(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("n_steps", [1, 3])
