@@ -126,7 +126,9 @@ class Experiment(ExperimentManager):
             hyperparams.setdefault("monitor_kwargs", success)
             # rl_zoo3's own Monitor stands inside the wrappers, and reports another reward
             outside = "stable_baselines3.common.monitor.Monitor"
-            hyperparams["env_wrapper"] = [*hyperparams.get("env_wrapper", []), outside]
+            wrappers = hyperparams.get("env_wrapper") or []  # one may stand there without a list
+            wrappers = wrappers if isinstance(wrappers, list) else [wrappers]
+            hyperparams["env_wrapper"] = [*wrappers, outside]
         processed = super()._preprocess_hyperparams(hyperparams)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs

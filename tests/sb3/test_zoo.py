@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import optuna
 import pytest
@@ -334,6 +335,34 @@ def test_no_yaml_of_ours_is_evaluated(path):
     sections = yaml.safe_load(path.read_text(encoding="utf-8"))
     for name, section in sections.items():
         assert not [key for key in zoo.EVALUATED if isinstance(section.get(key), str)], name
+
+
+@pytest.mark.parametrize(
+    ("given", "made"),
+    [
+        ("toy_env.Named", ["Named"]),
+        ({"toy_env.Named": {"word": "said"}}, ["Named said"]),
+        (["toy_env.Named", {"toy_env.Named": {"word": "said"}}], ["Named", "Named said"]),
+        (None, []),
+    ],
+)
+def test_env_wrapper_is_text_a_mapping_or_a_list(given, made, tiny, monkeypatch):
+    seen = []
+
+    class Named(gym.Wrapper):
+        def __init__(self, env, word=""):
+            super().__init__(env)
+            seen.append(f"Named {word}".strip())
+
+    monkeypatch.setattr("toy_env.Named", Named, raising=False)
+    file = Path("td3bc.yml")
+    section = yaml.safe_load(file.read_text())
+    section["ToyReach-v0"] |= {"env_wrapper": given, "warmup_steps": 0, "n_timesteps": 5}
+    file.write_text(yaml.safe_dump(section))
+    assert zoo.main(["train", *tiny[0]]) == 0
+    assert seen == made
+    folder, _ = run_of("ToyReach-v0")
+    assert list(folder.glob("*.monitor.csv"))
 
 
 def test_text_that_would_be_evaluated_is_refused(tiny, capsys):
