@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         help="takes the preset of its name (td3bc)",
     )
     train.add_argument("--demo", type=Path, help="demonstration; recorded when it is not there")
-    train.add_argument("--seed", type=int, default=0)
+    train.add_argument("--seed", type=int, help="of all random generators (0)")
     train.add_argument("--out", type=Path, help="run folder (runs/<id after the slash>-<seed>)")
     train.add_argument("--preset", help="a section of zoo_configs/td3bc.yml or baselines.yml")
     train.add_argument("--steps", type=int, help="agent steps")
@@ -325,17 +325,23 @@ def _train(args: argparse.Namespace) -> None:
     process.set_threads()
     if args.resume is None and not args.env:
         raise ValueError("--env is missing: name an environment, or --resume a run")
-    if args.resume is not None and (args.env or args.set or args.steps or args.preset or args.demo):
-        raise ValueError("--resume goes on with the run's own settings: give it alone")
+    own = ("env", "algo", "demo", "seed", "out", "preset", "steps", "set")
+    given = [f"--{name}" for name in own if getattr(args, name) not in (None, [])]
+    if args.resume is not None and given:
+        raise ValueError(
+            "--resume goes on with the run's own settings, in its folder: give it alone, without "
+            + ", ".join(given)
+        )
     if args.episodes < 1:
         raise ValueError(f"--episodes is {args.episodes}: at least 1 is needed")
-    run = args.resume or args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-{args.seed}"
+    seed = args.seed or 0
+    run = args.resume or args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-{seed}"
     try:
         if args.resume is not None:
             training.resume(run)
         else:
             preset = args.preset or (None if args.algo == "td3bc" else args.algo)
-            settings = make_settings(args.env, preset, args.seed, args.steps, args.set)
+            settings = make_settings(args.env, preset, seed, args.steps, args.set)
             if args.algo not in (None, settings.algo):
                 raise ValueError(
                     f"--algo {args.algo}: preset {preset!r} is of {settings.algo}, leave one out"
@@ -345,7 +351,7 @@ def _train(args: argparse.Namespace) -> None:
             if not demo.exists():
                 size = encoder_size(settings)
                 try:
-                    _record(args.env, demo, args.seed, settings.env_kwargs, size)
+                    _record(args.env, demo, seed, settings.env_kwargs, size)
                 except ValueError as error:
                     raise ValueError(
                         f"{demo} is not there ({error}): make one with `regil record`, "
