@@ -116,8 +116,10 @@ class EpisodeWriter:
     def _write(self, path: Path, episode: Demonstration) -> None:
         try:
             episode.save(path)
-        except OSError as error:
-            self.error = f"{path.name} was not written ({error.strerror or error})"
+        except Exception as error:  # whatever it is, no episode is lost and others follow
+            self.error = (
+                f"{path.name} was not written ({getattr(error, 'strerror', None) or error})"
+            )
             warnings.warn(f"{self.error}; it is kept in memory", RuntimeWarning, stacklevel=2)
         else:
             self._unwritten = [(p, e) for p, e in self._unwritten if p != path]

@@ -321,6 +321,32 @@ def test_a_late_step_stops_the_arm_in_real_time_and_homing_brings_it_back():
     env.close()
 
 
+def test_an_episode_that_the_library_cannot_write_is_kept_and_others_follow(tmp_path, monkeypatch):
+    writer = EpisodeWriter(tmp_path / "episodes")
+    save, calls = Demonstration.save, []
+
+    def failing(self, path):
+        calls.append(path)
+        if len(calls) <= 2:
+            raise RuntimeError("Can't decrement id ref count")  # h5py's, of a disk that is full
+        save(self, path)
+
+    monkeypatch.setattr(Demonstration, "save", failing)
+    black = np.zeros((84, 84, 3), np.uint8)
+
+    def two_episodes():
+        for _ in range(2):
+            writer.begin(black)
+            writer.add(STILL, black, False)
+            writer.end({})
+        writer._queue.join()
+
+    with pytest.warns(RuntimeWarning, match="was not written .Can't decrement"):
+        two_episodes()
+    writer.close()
+    assert len(list((tmp_path / "episodes").iterdir())) == 2
+
+
 def test_a_full_disk_keeps_the_episode_until_there_is_room(tmp_path):
     writer = EpisodeWriter(tmp_path / "episodes")
     rng = np.random.default_rng(0)
