@@ -8,27 +8,14 @@ import time
 import numpy as np
 import pytest
 import toy_env
+from at_step import At
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from regil_sb3 import TD3BC
 from regil_sb3.background import BackgroundTD3BC
 from regil_sb3.checkpoint import CheckpointCallback, ReplayableEpisode, callback
 from regil_sb3.checkpoint.learner_state import learner_state
-
-
-class At(BaseCallback):
-    """Does something at a step."""
-
-    def __init__(self, step, what):
-        super().__init__()
-        self.step, self.what = step, what
-
-    def _on_step(self):
-        if self.num_timesteps == self.step:
-            self.what()
-        return True
 
 
 def made(demo, pauses=None, replayable=False, **arguments):

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from at_step import At
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
@@ -265,19 +266,6 @@ def test_what_takes_too_long_is_broken_off(tmp_path):
     with pytest.raises(Preempted):
         new_model(toy()).learn(STEPS, [checkpoints, Hang()])
     assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 80
-
-
-class At(BaseCallback):
-    """Does something at a step."""
-
-    def __init__(self, step, what):
-        super().__init__()
-        self.step, self.what = step, what
-
-    def _on_step(self):
-        if self.num_timesteps == self.step:
-            self.what()
-        return True
 
 
 def test_a_removed_folder_is_noticed_and_training_goes_on(tmp_path):
