@@ -95,6 +95,7 @@ def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
         # what learns from the demonstration alone makes no steps
         steps_to = (lambda *_: np.nan) if evaluation.get("frames") == 0 else _steps_to
         reached = {f"steps to {level}": steps_to(run, level) for level in LEVELS}
+        made_on = "; ".join(machines([run]))
         learned = {"minutes": (seconds_of(run) or np.nan) / 60, **reached}
         for method, name in ((run.method, "policy"), *run.beside):
             if name not in evaluation:
@@ -104,7 +105,7 @@ def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
                     "task": task_of(run.env),
                     "method": method,
                     "run": run.folder.name,
-                    "machines": "; ".join(machines([run])),
+                    "machines": made_on,
                     "evaluated": name,
                     "seed": run.seed,
                     "steps": run.steps,

@@ -197,7 +197,7 @@ def predicted_hours(runs: Sequence[Run], workers: int) -> float:
     return rate * sum(run.steps for run in runs if not run.finished) / max(workers, 1) / 3600
 
 
-def finish(run: Run, patience: float = 60.0) -> None:
+def finish(run: Run, patience: float = _GRACE) -> None:
     """Train, or go on, and evaluate.
 
     Args:

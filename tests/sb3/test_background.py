@@ -152,7 +152,7 @@ def test_a_failure_of_the_learner_ends_a_save(demo, tmp_path, monkeypatch):
     assert CheckpointCallback(tmp_path).generations.numbers
 
 
-def test_a_failure_of_the_learner_ends_learning_ends_learning(demo, monkeypatch):
+def test_a_failure_of_the_learner_ends_learning(demo, monkeypatch):
     def broken(self, *_):
         raise FloatingPointError("critic loss is nan")
 

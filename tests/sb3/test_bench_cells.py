@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 
+import missing_weights
 import pyarrow.parquet as parquet
 import pytest
-from regil_wrappers.encoders.weights import MissingWeightsError
 
 from regil_sb3.bench import cells, replay, sensitivity, success_buffer
 from regil_sb3.bench.cells import Cell, below, finish, predicted_hours
@@ -93,14 +93,7 @@ def test_a_spoilt_file_gets_one_line(tmp_path, text):
 
 @pytest.fixture
 def without_dinov3(monkeypatch):
-    make_encoder = sensitivity.make_encoder
-
-    def made(name):
-        if name == "dinov3":
-            raise MissingWeightsError("encoder 'dinov3': its weights are not here (a folder)")
-        return make_encoder(name)
-
-    monkeypatch.setattr(sensitivity, "make_encoder", made)
+    missing_weights.without_dinov3(monkeypatch, sensitivity)
 
 
 def test_sensitivity_varies_one_at_a_time(tmp_path, without_dinov3):

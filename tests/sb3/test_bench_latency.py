@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import missing_weights
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
@@ -14,7 +15,6 @@ from regil_wrappers.alignment import (
     squared_distances,
     warping_path,
 )
-from regil_wrappers.encoders.weights import MissingWeightsError
 
 from regil_sb3.bench import latency, machine, tables
 from regil_sb3.bench.peers import LIBROSA_ON_COSTS, PEERS
@@ -135,16 +135,9 @@ def test_retrieval_has_no_encoders():
 
 
 def test_an_encoder_without_weights_says_so_in_its_line(monkeypatch):
-    make_encoder = latency.make_encoder
-
-    def made(name):
-        if name == "dinov3":
-            raise MissingWeightsError("its weights are not here")
-        return make_encoder(name)
-
-    monkeypatch.setattr(latency, "make_encoder", made)
+    missing_weights.without_dinov3(monkeypatch, latency)
     rows = list(latency.latency(["dinov3", "pixels"], [20], blocks=1, steps=1))
-    assert rows[0].missing == "its weights are not here"
+    assert rows[0].missing == missing_weights.WHY
     assert rows[1].encoder == "pixels"
 
 
