@@ -23,6 +23,7 @@ from regil_sb3.report.run_contents import RunContents, column, number, read_run,
 __all__ = ["NOTE", "methods", "plots", "scores", "write_comparison"]
 
 _COLOURS = 6  # as many as the page has for methods
+_STYLES = ("solid", "dashed", "dotted")  # of lines: a colour comes once in each
 _NOT_COMPARED = ("env", "seed", "versions.")
 _NAMED = 2  # settings in a method's name
 
@@ -55,7 +56,7 @@ def write_comparison(runs: Sequence[Path | str], out: Path | str) -> Path:
 
     Raises:
         ValueError: if one is not a run folder, none has been evaluated, there are more methods than
-            colours, or ``out`` is a folder.
+            lines that can be told apart, or ``out`` is a folder.
     """
     out = Path(out)
     if out.is_dir():
@@ -93,12 +94,12 @@ def plots(named: Named, beside: str = "") -> str:
         beside: HTML to stand below the second of them.
 
     Raises:
-        ValueError: there are more methods than colours.
+        ValueError: there are more methods than lines that can be told apart.
     """
-    if len(named) > _COLOURS:
+    if len(named) > (most := _COLOURS * len(_STYLES)):
         raise ValueError(
             f"these are runs of {len(named)} methods ({'; '.join(named)}): compare at most "
-            f"{_COLOURS} at once"
+            f"{most} at once"
         )
     columns = (
         card("Success over steps", _curves(named)),
@@ -181,8 +182,9 @@ def _scores(runs: Runs, tasks: Sequence[str]) -> list[list[float]]:
     return [scores for scores in by_task.values() if scores]
 
 
-def _colour(i: int) -> str:
-    return f'style="--c:var(--m{i})"'
+def _look(i: int) -> tuple[str, str]:
+    """A method's colour, a variable of the page, and the style of its lines."""
+    return f"m{i % _COLOURS}", _STYLES[i // _COLOURS]
 
 
 def _within(found: Interval) -> str:
@@ -195,10 +197,12 @@ def scores(named: Named) -> str:
     """HTML: a box for each method, with the interquartile mean of its runs' success."""
     cards, tasks = [], _tasks(named)
     for i, (name, runs) in enumerate(named.items()):
+        colour, style = _look(i)
         found = iqm(_scores(runs, tasks))
         n_tasks = len({run.env for run in runs})
         cards.append(
-            f'<div class="card score" {_colour(i)}><span>{html.escape(name)}</span>'
+            f'<div class="card score {style}" style="--c:var(--{colour})">'
+            f"<span>{html.escape(name)}</span>"
             f"<b>{100 * found.value:.0f} %</b>"
             f'<span class="soft small">{_within(found)}<br>{len(runs)} '
             f"{'run' if len(runs) == 1 else 'runs'}, {n_tasks} "
@@ -235,7 +239,8 @@ def _curves(named: Named) -> str:
             points.append((step, found.value))
             if not math.isnan(found.low):
                 spread.append((step, found.low, found.high))
-        lines.append(Line(name, f"m{i}", points, spread=spread))
+        colour, style = _look(i)
+        lines.append(Line(name, colour, points, style, spread=spread))
     note = (
         '<p class="soft small">Evaluations while training, on seeds for selection: interquartile '
         "mean and its interval.</p>"
@@ -293,6 +298,7 @@ def _task_row(task: str, named: Named) -> str:
 def _runs(named: Named) -> str:
     rows = []
     for i, (name, runs) in enumerate(named.items()):
+        colour, style = _look(i)
         for run in sorted(runs, key=lambda run: (run.env, str(run.config.get("seed")))):
             outcomes = successes(run.evaluation.get("policy"))
             low, high = wilson(sum(outcomes), len(outcomes))
@@ -304,9 +310,9 @@ def _runs(named: Named) -> str:
                 f"{sum(outcomes)} of {len(outcomes)} ({low:.0f} to {high:.0f} %)",
                 str(run.folder),
             ]
-            dot = f'<span class="legend"><span><i class="dots" {_colour(i)}></i>'
+            line = f'<i class="{style}" style="--c:var(--{colour})"></i>'
             rows.append(
-                f"<tr><td>{dot}{html.escape(name)}</span></span></td>"
+                f'<tr><td><span class="legend"><span>{line}{html.escape(name)}</span></span></td>'
                 + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
                 + "</tr>"
             )

@@ -13,7 +13,7 @@ from scipy import stats
 
 from regil_sb3.cli import main
 from regil_sb3.intervals import improvement, iqm, wilson
-from regil_sb3.report.comparison import methods, write_comparison
+from regil_sb3.report.comparison import methods, plots, write_comparison
 from regil_sb3.report.run_contents import read_run
 
 OTHER = "regil/metaworld-hammer-v0"
@@ -107,10 +107,19 @@ def test_what_was_not_evaluated_is_said(runs, tmp_path, capsys):
     assert "is a folder" in capsys.readouterr().err
 
 
-def test_more_methods_than_colours(tmp_path, capsys):
+def test_more_methods_than_colours_differ_in_their_lines(tmp_path):
     many = [made_run.run(tmp_path / f"{i}", films=False, bc_coef=float(i)) for i in range(7)]
-    assert main(["report", *map(str, many)]) == 2
-    assert "7 methods (bc_coef=0.0; bc_coef=1.0;" in capsys.readouterr().err
+    page = write_comparison(many, tmp_path / "page.html").read_text("utf-8")
+    lines = re.findall(r'<polyline class="series (\w+)" style="--c:var\(--(m\d)\)"', page)
+    assert len(set(lines)) == 7
+    assert lines[0] == ("solid", "m0")
+    assert lines[6] == ("dashed", "m0")
+
+
+def test_more_methods_than_lines(runs):
+    named = {f"method {i}": [read_run(runs[0])] for i in range(19)}
+    with pytest.raises(ValueError, match=r"19 methods .method 0; method 1;.*at most 18"):
+        plots(named)
 
 
 def test_everything_read_is_escaped(runs, tmp_path):
