@@ -13,9 +13,11 @@ import psutil
 
 __all__ = ["describe", "together"]
 
+_CODE = [f":/{folder}" for folder in ("regil_sb3", "wrappers", "zoo_configs")]
+
 
 def describe(packages: Sequence[str]) -> str:
-    """One line to stand below a table: processor, memory, threads, versions, commit.
+    """One line to stand below a table: processor, memory, GPU, threads, versions, commit.
 
     Args:
         packages: distributions whose versions matter; those that are not installed are left out.
@@ -23,6 +25,7 @@ def describe(packages: Sequence[str]) -> str:
     parts = [
         f"{_processor()}, {os.cpu_count()} cores",
         f"{psutil.virtual_memory().total / 1024**3:.0f} GiB",
+        *_gpus(),
         f"OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS', 'unset')}",
         f"Python {platform.python_version()}",
     ]
@@ -55,12 +58,24 @@ def _processor() -> str:
     return names[0] if names else platform.machine()
 
 
+def _gpus() -> list[str]:
+    """Name and driver of each kind of NVIDIA GPU that this process may use."""
+    if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
+        return []
+    asked = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
+    try:
+        told = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return []
+    return [line.replace(", ", " (driver ") + ")" for line in dict.fromkeys(told.splitlines())]
+
+
 def _commit() -> str:
-    """Of the checkout that this file is of, with a + where something in it was changed."""
+    """Of the checkout that this file is of, with a + where its code or presets were changed."""
     here = Path(__file__).parent
     asked = (
         ("rev-parse", "--short", "HEAD"),
-        ("status", "--porcelain", "-uno"),
+        ("status", "--porcelain", "-uno", "--", *_CODE),
         ("ls-files", "--error-unmatch", Path(__file__).name),  # not in somebody else's
     )
     try:

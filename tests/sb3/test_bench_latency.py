@@ -142,7 +142,7 @@ def test_an_encoder_without_weights_says_so_in_its_line(monkeypatch):
 
 
 def test_the_commit_is_not_that_of_somebody_elses_checkout(tmp_path, monkeypatch):
-    place = tmp_path / "site-packages" / "machine.py"
+    place = tmp_path / "regil_sb3" / "machine.py"
     place.parent.mkdir()
     place.touch()
     git = ["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b"]
@@ -152,6 +152,21 @@ def test_the_commit_is_not_that_of_somebody_elses_checkout(tmp_path, monkeypatch
     assert machine.describe([]).endswith(", commit unknown")
     subprocess.run([*git, "add", "."], check=True)
     assert re.search(r", commit [0-9a-f]{7,}\+$", machine.describe([]))
+    subprocess.run([*git, "commit", "-q", "-m", "ours"], check=True)
+    (tmp_path / "notes.md").touch()  # no code
+    subprocess.run([*git, "add", "."], check=True)
+    assert re.search(r", commit [0-9a-f]{7,}$", machine.describe([]))
+
+
+def test_gpus_are_named_where_they_may_be_used(tmp_path, monkeypatch):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text("#!/bin/sh\necho 'NVIDIA H100, 570.1'\necho 'NVIDIA H100, 570.1'\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    assert " GiB, NVIDIA H100 (driver 570.1), OMP" in machine.describe([])
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert "NVIDIA" not in machine.describe([])
 
 
 def test_the_machine_in_one_line(monkeypatch):
