@@ -9,14 +9,14 @@ Ray is imported when it is asked for.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 __all__ = ["SHOWN_EVERY", "Shares", "call_all", "connect"]
 
 SHOWN_EVERY = 5.0
 """Seconds between two looks at how far tasks are."""
 
-_AGAIN = 3  # times that a task whose node was lost is begun again
+_AGAIN = 3  # times that a task that was lost is begun again
 
 T = TypeVar("T")
 
@@ -85,6 +85,7 @@ def call_all(
     shares: Shares,
     show: Callable[[], None],
     grace: float,
+    again: Sequence[type[Exception]] = (),
 ) -> list[str]:
     """Call a function with each argument, somewhere on the cluster.
 
@@ -94,6 +95,7 @@ def call_all(
         shares: that each has.
         show: called every few seconds.
         grace: s that calls are given to end when this one is interrupted: each is, too.
+        again: what a call may raise and is begun again after, as if its node had been lost.
 
     Returns:
         for each argument "", or in a line why the call failed.
@@ -103,12 +105,14 @@ def call_all(
     """
     import ray
 
-    task = ray.remote(
-        num_cpus=shares.cpus,
-        num_gpus=shares.gpus,
-        memory=int(shares.memory * 2**30),
-        max_retries=_AGAIN,
-    )(function)
+    options: dict[str, Any] = {
+        "num_cpus": shares.cpus,
+        "num_gpus": shares.gpus,
+        "memory": int(shares.memory * 2**30),
+        "max_retries": _AGAIN,
+        "retry_exceptions": list(again),
+    }
+    task: Any = ray.remote(**options)(function)
     pending = references = [task.remote(argument) for argument in arguments]
     try:
         while pending:

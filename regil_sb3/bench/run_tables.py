@@ -53,7 +53,8 @@ def planned(
         methods: the table's that are wanted.
 
     Raises:
-        ValueError: there is no such task or method, or nothing would be learned or evaluated.
+        ValueError: there is no such task or method, or nothing would be learned or evaluated: a
+            run would end before its warm-up does.
     """
     own = said()[name]
     counts = {"steps": steps, "episodes": episodes}
@@ -61,7 +62,7 @@ def planned(
     for method in methods or ():
         if method not in own["methods"]:
             raise ValueError(f"--methods {method}: choose from {', '.join(own['methods'])}")
-    return [
+    runs = [
         Run(
             root=str(root),
             env=env_id(task),
@@ -81,6 +82,11 @@ def planned(
         for method, asked in own["methods"].items()
         if not methods or method in methods
     ]
+    warmups = {run.method: run.settings_now.warmup_steps for run in runs}
+    if short := [f"{name}'s of {n}" for name, n in warmups.items() if runs[0].steps <= n]:
+        told = ", ".join(short)
+        raise ValueError(f"--steps {runs[0].steps} end before the warm-up does ({told}): take more")
+    return runs
 
 
 def raw(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
@@ -120,7 +126,8 @@ def _steps_to(run: Run, level: float) -> float:
     """Agent steps at the first evaluation during training that reached it; NaN: none did."""
     with (run.folder / "progress.csv").open(newline="") as file:
         for row in csv.DictReader(file):
-            if row["eval/success_rate"] and float(row["eval/success_rate"]) >= level:
+            # a budget that ends soon after the warm-up has no evaluation, and no such column
+            if (rate := row.get("eval/success_rate")) and float(rate) >= level:
                 return float(row["time/total_timesteps"])
     return float("nan")
 
@@ -128,8 +135,9 @@ def _steps_to(run: Run, level: float) -> float:
 def table(runs: Sequence[Run]) -> list[str]:
     """The table in Markdown: a line a method, a column a task, and the mean over tasks.
 
-    A cell is the mean over seeds; in brackets the paper's own, after ten times the steps. The
-    interquartile mean over tasks and seeds has a 95 % interval by the stratified bootstrap.
+    A cell is the mean over seeds; in brackets the paper's own, after 300,000 frames, or of what
+    learns from the demonstration alone, 100,000 updates. The interquartile mean over tasks and
+    seeds has a 95 % interval by the stratified bootstrap.
     """
     rows = list(raw(runs))
     tasks = list(dict.fromkeys(row["task"] for row in rows))
@@ -191,10 +199,13 @@ def _paper_reached(rows: Sequence[Mapping[str, Any]]) -> str:
 def _narrow(rows: Sequence[Mapping[str, Any]]) -> str:
     """What a bootstrap's interval of so few runs is worth."""
     runs = {(row["task"], row["method"], row["seed"]) for row in rows}
-    fewest = min(Counter((task, method) for task, method, _ in runs).values())
-    if not 1 < fewest < _ENOUGH:
+    counts = Counter((task, method) for task, method, _ in runs)
+    methods = {method for _, method in counts}
+    fewest = [min(n for (_, of), n in counts.items() if of == method) for method in methods]
+    drawn = [n for n in fewest if n > 1]  # of one run there is no interval
+    if not drawn or min(drawn) >= _ENOUGH:
         return ""
-    return f"Intervals of {fewest} runs a task are too narrow (docs/bench.md). "
+    return f"Intervals of {min(drawn)} runs a task are too narrow (docs/bench.md). "
 
 
 def _better(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -260,9 +271,10 @@ def main(
     if dry_run:
         for run in runs:
             print(f"{run.folder}: {'finished' if run.finished else run.command}")
+        at_a_time = "one after the other" if ray else f"{workers} at a time"
         print(
             f"{len(missing)} of {len(runs)} runs to make: about "
-            f"{predicted_hours(runs, workers):.1f} hours, {workers} at a time"
+            f"{predicted_hours(runs, 1 if ray else workers):.1f} hours, {at_a_time}"
         )
         if len(missing) < len(runs):
             print("\n".join(["", *table(runs)]))
@@ -273,11 +285,13 @@ def main(
     if rows:
         lines = table(runs)
         seeds = ", ".join(map(str, sorted({row["seed"] for row in rows})))
+        not_made = [run.folder.name for run in runs if not run.finished]
         hours = sum(seconds_of(run) or 0 for run in runs if run.finished) / 3600
         below = (
             f"{_better(rows)}{_paper_reached(rows)}{_narrow(rows)}"
-            f"Seeds {seeds}; {hours:.1f} hours, one run after "
-            f"the other; {together(machines(runs))}"
+            + (f"Not made: {', '.join(not_made)}. " if not_made else "")
+            + "What was tuned for which method: docs/baselines.md. "
+            f"Seeds {seeds}; {hours:.1f} hours, one run after the other; {together(machines(runs))}"
         )
         steps = options.get("steps")
         called = "" if steps in (None, said()[name]["steps"]) else f"{name}-{steps}"

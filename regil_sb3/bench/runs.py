@@ -14,6 +14,7 @@ Tables need of it ``config.yaml``, ``progress.csv``, ``evaluation.json`` and ``t
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import os
 import signal
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from regil_sb3.settings import Settings
 
 __all__ = [
+    "KilledError",
     "Run",
     "finish",
     "finish_all",
@@ -46,11 +48,17 @@ __all__ = [
     "seconds_of",
 ]
 
-_PACKAGES = ("gymnasium", "metaworld", "mujoco", "stable-baselines3", "torch", "regil-sb3")
+_SIMULATORS = ("metaworld", "hf-libero", "robosuite", "mujoco")
+_PACKAGES = ("gymnasium", *_SIMULATORS, "stable-baselines3", "torch", "regil-sb3")
 
 _SECONDS_A_STEP = 15 * 60 / 15_000  # of one core, until a run has told
 _GRACE = 60.0  # s that an interrupted run is given to save itself
+_NOTED_EVERY = 60.0  # s between two notes of what a run has taken
 _LOST = 240.0  # s until a file system of several machines has given up a lost one's lock
+
+
+class KilledError(RuntimeError):
+    """A run's process was ended from outside: by the kernel for memory, or by a scheduler."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +142,7 @@ class Run:
 
 
 def _took(run: Run) -> dict[str, Any]:
-    """``seconds``, and ``machines`` in the order in which they went on with it."""
+    """``seconds``, ``machines`` in the order in which they went on, and ``demo``, its digest."""
     try:
         told = json.loads((run.folder / "took.json").read_text("utf-8"))
     except (OSError, ValueError):
@@ -142,10 +150,37 @@ def _took(run: Run) -> dict[str, Any]:
     return told if isinstance(told, dict) else {}
 
 
-def _write_took(run: Run, seconds: float, here: str) -> None:
+def _write_took(run: Run, seconds: float, here: str, demo: str) -> None:
     where = list(dict.fromkeys([*_took(run).get("machines", ()), here]))
+    told = {"seconds": seconds, "machines": where, "demo": demo}
     with replacing(run.folder / "took.json") as file:
-        file.write(json.dumps({"seconds": seconds, "machines": where}).encode())
+        file.write(json.dumps(told).encode())
+
+
+def _digest(demo: str) -> str:
+    """Of what a demonstration's file holds."""
+    from regil_wrappers import Demonstration
+
+    loaded, found = Demonstration.load(demo), hashlib.sha256()
+    for part in (loaded.frames, loaded.actions):
+        found.update(b"" if part is None else part.tobytes())
+    return found.hexdigest()[:20]
+
+
+def _same_demonstrations(runs: Sequence[Run]) -> None:
+    """Refuse to put runs beside others of another demonstration.
+
+    Raises:
+        ValueError: one was made with another than is there now.
+    """
+    here = {demo: _digest(demo) for demo in {run.demo for run in runs} if Path(demo).exists()}
+    for run in runs:
+        told = _took(run).get("demo")
+        if None not in (told, now := here.get(run.demo)) and told != now:
+            raise ValueError(
+                f"{run.folder} was made with another demonstration than {run.demo} is now: remove "
+                "the run, and it is made again, bring its demonstration, or name another --out"
+            )
 
 
 def seconds_of(run: Run) -> float | None:
@@ -205,6 +240,7 @@ def finish(run: Run, patience: float = _GRACE) -> None:
         patience: s that another process may still hold it, saving it.
 
     Raises:
+        KilledError: its process was; it goes on from its checkpoint when it is finished once more.
         RuntimeError: it could not be done; ``log.txt`` in the run's folder says why.
         ValueError: another process is at it, and goes on.
     """
@@ -216,21 +252,29 @@ def finish(run: Run, patience: float = _GRACE) -> None:
         return
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the run's, and said below tables
     begun, took, here = time.time(), seconds_of(run) or 0.0, describe(_PACKAGES)
-    _write_took(run, took, here)
+    demo, written = _digest(run.demo), begun
+    _write_took(run, took, here, demo)
     process = get_context("spawn").Process(target=_train, args=(run,))
     process.start()
     try:
         while process.is_alive():
             process.join(1.0)  # Ray's way to interrupt waits for Python's own code
+            if time.time() > written + _NOTED_EVERY:  # this process may be killed, too
+                written = time.time()
+                _write_took(run, took + written - begun, here, demo)
     except BaseException:
         assert process.pid is not None
         os.kill(process.pid, signal.SIGINT)  # it saves itself
         process.join(_GRACE)
         raise
     finally:
-        _write_took(run, took + time.time() - begun, here)
+        _write_took(run, took + time.time() - begun, here, demo)
     if process.exitcode or not run.finished:
-        raise RuntimeError(f"{run.folder} ended with status {process.exitcode}: see log.txt there")
+        from regil_sb3.checkpoint.callback import TRY_AGAIN
+
+        status = process.exitcode or 0
+        ended = f"{run.folder} ended with status {status}: see log.txt there"
+        raise KilledError(ended) if status < 0 or status == TRY_AGAIN else RuntimeError(ended)
 
 
 def _finish_there(run: Run) -> None:
@@ -306,7 +350,8 @@ def finish_all(
 
     Raises:
         ImportError: Ray is not installed.
-        ValueError: no node of the cluster has a run's share.
+        ValueError: no node of the cluster has a run's share, or a run was made with another
+            demonstration.
         KeyboardInterrupt: passed on once all runs have saved themselves.
     """
     shares = Shares(cpus, gpus, memory)
@@ -318,6 +363,7 @@ def finish_all(
     if ray:
         connect(ray, shares)
     _record(todo)
+    _same_demonstrations(runs)
     with tqdm(total=sum(run.steps for run in todo), unit="step", dynamic_ncols=True) as bar:
 
         def show() -> None:
@@ -329,7 +375,7 @@ def finish_all(
         bar.n = bar.initial = sum(_steps_done(run) for run in todo)
         if ray:
             there = [_absolute(run) for run in todo]  # workers have another current folder
-            results = call_all(_finish_there, there, shares, show, _GRACE)
+            results = call_all(_finish_there, there, shares, show, _GRACE, (KilledError,))
         else:
             results = _here(todo, workers, show)
         return [

@@ -150,6 +150,8 @@ def test_tables_are_what_evaluations_say(tmp_path):
     assert run_tables._narrow(rows) == ""  # of one run there is no interval
     two = [row for row in rows if row["task"] == "button-press"]
     assert run_tables._narrow(two) == "Intervals of 2 runs a task are too narrow (docs/bench.md). "
+    one = [{**row, "method": "RFCL"} for row in two if row["seed"] == 0]
+    assert run_tables._narrow(two + one).startswith("Intervals of 2 runs ")
     many = [{**row, "seed": seed} for row in rows for seed in range(5)]
     assert run_tables._narrow(many) == ""
 
@@ -175,7 +177,14 @@ def test_bench_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert any("--preset ablation-rl " in line for line in said)
     assert not list(tmp_path.iterdir())
     negative = ["--gpus", "-1", "--ray", "local"]
-    wrong = (["--episodes", "0"], ["--steps", "-3"], ["--gpus", "1"], negative, ["--tasks", "fly"])
+    wrong = (
+        ["--episodes", "0"],
+        ["--steps", "-3"],
+        ["--steps", "2000"],
+        ["--gpus", "1"],
+        negative,
+        ["--tasks", "fly"],
+    )
     for words in (["--methods", "magic"], ["--workers", "0"], ["--plot", "x"], *wrong):
         assert main(["bench", "ablations", *words]) == 2
         assert capsys.readouterr().err.count("\n") == 1
@@ -208,6 +217,52 @@ def test_what_is_written(runs, failed, tmp_path, monkeypatch, capsys):
     run_tables.main("ablations", out=str(tmp_path), steps=60_000)
     assert "--steps 60000" in (tmp_path / "ablations-60000.md").read_text()
     assert (tmp_path / "ablations.md").read_text() == text
+    assert "Not made" not in text
+    monkeypatch.setattr(run_tables, "planned", lambda *_, **__: [*kept_alone, runs[2]])
+    with pytest.raises(ValueError, match="1 runs failed: Reach-bad"):
+        run_tables.main("ablations", out=str(tmp_path))
+    assert f"Not made: {runs[2].folder.name}. " in (tmp_path / "ablations.md").read_text()
+
+
+def test_runs_beside_others_have_their_demonstration(runs, failed, tmp_path):
+    shutil.copytree(runs[0].folder, tmp_path / runs[0].folder.name)
+    kept, more = (replace(run, root=str(tmp_path)) for run in runs[:2])
+    runs_module._same_demonstrations([kept, more])
+    other = str(tmp_path / "other.hdf5")
+    demonstration(0.5).save(other)
+    with pytest.raises(ValueError, match=r"was made with another demonstration .* bring its"):
+        finish_all([replace(run, demo=other) for run in (kept, more)])
+    assert not more.folder.exists()
+
+
+def killed_once(run):
+    """A thread that kills the run's process when it has noted what it has taken."""
+
+    def kill():
+        while not (run.folder / "progress.csv").exists() or seconds_of(run) is None:
+            time.sleep(0.1)
+        os.kill(int((run.folder / ".lock").read_text()), signal.SIGKILL)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    return thread
+
+
+def test_a_run_whose_process_is_killed_is_told_from_one_that_fails(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setattr(runs_module, "_NOTED_EVERY", 0.0)
+    run = toy_run(tmp_path, steps=100_000)
+    noted = []
+    write = runs_module._write_took
+    monkeypatch.setattr(
+        runs_module, "_write_took", lambda *words: (noted.append(words[1]), write(*words))
+    )
+    killer = killed_once(run)
+    with pytest.raises(runs_module.KilledError, match="ended with status -9: see"):
+        runs_module.finish(run)
+    killer.join()
+    assert noted == sorted(set(noted))  # every now and then: this process may be killed, too
+    assert len(noted) > 3
 
 
 def test_a_run_that_another_process_still_saves_is_waited_for(runs, failed, monkeypatch):
@@ -302,6 +357,23 @@ def test_a_bench_that_was_killed_goes_on(tmp_path, monkeypatch):
     assert run.finished
     (run.folder / "evaluation.json").unlink()  # as if it had been killed before
     assert finish_all([run]) == []
+    assert run.finished
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1_200)  # Ray's workers take long to start on busy cores
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Ray 2.40's logs
+def test_on_a_cluster_a_run_whose_process_is_killed_goes_on(tmp_path, monkeypatch):
+    import ray
+
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")]))
+    run = toy_run(tmp_path, steps=600)
+    killer = killed_once(run)
+    try:
+        assert finish_all([run], ray="local", cpus=0.5) == []
+    finally:
+        ray.shutdown()
+    killer.join()
     assert run.finished
 
 
