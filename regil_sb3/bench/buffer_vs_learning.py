@@ -34,7 +34,9 @@ class Learned:
     Attributes:
         run: its folder.
         task: Meta-World's name, or the environment's id.
-        seed: of the run.
+        preset: of the run.
+        seed: likewise.
+        steps: that it made.
         warmup: agent steps in which the guide acted.
         buffer: transitions in the success buffer when they were over, the demonstration's left out.
         successes: of the last policy.
@@ -43,7 +45,9 @@ class Learned:
 
     run: str
     task: str
+    preset: str
     seed: int
+    steps: int
     warmup: int
     buffer: int
     successes: int
@@ -61,7 +65,7 @@ class Rank(NamedTuple):
     Attributes:
         rho: in [-1, 1].
         p: two-sided, of a permutation test (exact where there are few runs).
-        n: runs.
+        n: warm-ups.
     """
 
     rho: float
@@ -109,6 +113,8 @@ def learned(folders: Sequence[Path | str]) -> tuple[list[Learned], list[str]]:
         buffer = buffer_after_warmup(run, settings.warmup_steps)
         if not settings.warmup_steps:
             left_out.append(f"{folder}: no guide acted in it")
+        elif settings.hyperparams.get("bc_coef") == 0:
+            left_out.append(f"{folder}: it does not learn from the buffer")
         elif not outcomes:
             left_out.append(f"{folder}: its policy is not evaluated (regil evaluate {folder})")
         elif buffer is None:
@@ -118,7 +124,9 @@ def learned(folders: Sequence[Path | str]) -> tuple[list[Learned], list[str]]:
                 Learned(
                     str(folder),
                     task_of(settings.env),
+                    settings.preset,
                     settings.seed,
+                    settings.steps,
                     settings.warmup_steps,
                     buffer,
                     sum(outcomes),
@@ -129,10 +137,18 @@ def learned(folders: Sequence[Path | str]) -> tuple[list[Learned], list[str]]:
 
 
 def rank(runs: Sequence[Learned]) -> Rank:
-    """Rank correlation of buffer and success."""
-    x, y = [run.buffer for run in runs], [run.success for run in runs]
-    if len(runs) < _FEWEST or len(set(x)) == 1 or len(set(y)) == 1:
-        return Rank(np.nan, np.nan, len(runs))
+    """Rank correlation of buffer and success.
+
+    Runs that had the same warm-up, and differ in what came after it, count as one: their mean.
+    """
+    warmups: dict[tuple[str, int, int, int], list[float]] = {}
+    for run in runs:
+        same = (run.task, run.seed, run.warmup, run.buffer)
+        warmups.setdefault(same, []).append(run.success)
+    x = [buffer for *_, buffer in warmups]
+    y = [float(np.mean(successes)) for successes in warmups.values()]
+    if len(warmups) < _FEWEST or len(set(x)) == 1 or len(set(y)) == 1:
+        return Rank(np.nan, np.nan, len(warmups))
     tested = stats.permutation_test(
         (x,),
         lambda x: stats.spearmanr(x, y).statistic,
@@ -140,25 +156,25 @@ def rank(runs: Sequence[Learned]) -> Rank:
         n_resamples=_RESAMPLES,
         rng=np.random.default_rng(0),
     )
-    return Rank(float(tested.statistic), float(tested.pvalue), len(runs))
+    return Rank(float(tested.statistic), float(tested.pvalue), len(warmups))
 
 
 def table(runs: Sequence[Learned]) -> list[str]:
     """The table in Markdown: a line a run, the fullest buffer first."""
-    lines = ["| task | seed | warm-up | buffer | success (95 %) | run |", "|" + "---|" * 6]
+    head = "| task | preset | seed | steps | warm-up | buffer | success (95 %) | run |"
+    lines = [head, "|" + "---|" * 8]
     for run in sorted(runs, key=lambda run: -run.buffer):
         low, high = (bound / 100 for bound in wilson(run.successes, run.episodes))
-        lines.append(
-            f"| {run.task} | {run.seed} | {run.warmup} | {run.buffer} | "
-            f"{run.success:.2f} ({low:.2f} to {high:.2f}) | {run.run} |"
-        )
+        success = f"{run.success:.2f} ({low:.2f} to {high:.2f})"
+        what = (run.task, run.preset, run.seed, run.steps, run.warmup, run.buffer, success, run.run)
+        lines.append(f"| {' | '.join(map(str, what))} |")
     return lines
 
 
 def _said(what: str, found: Rank) -> str:
     if np.isnan(found.rho):
-        return f"{what}: none, of {found.n}"
-    return f"{what}: {found.rho:+.2f} (p {found.p:.3f}) of {found.n}"
+        return f"{what}: none, of {found.n} warm-ups"
+    return f"{what}: {found.rho:+.2f} (p {found.p:.3f}) of {found.n} warm-ups"
 
 
 def _draw(runs: Sequence[Learned], path: Path) -> None:
@@ -174,25 +190,30 @@ def _draw(runs: Sequence[Learned], path: Path) -> None:
         axis.legend(fontsize=8)
 
 
-def main(runs: Sequence[str] = (), out: str = "bench") -> None:
+def main(runs: Sequence[str] = (), out: str = "bench", dry_run: bool = False) -> None:
     """Read runs, and print the table.
 
     Args:
         runs: folders that `regil train` or `regil bench` wrote; none: all evaluated ones in `out`.
         out: folder of ``buffer-vs-learning.md``, ``.tex``, ``.parquet`` and ``.png``.
+        dry_run: print the runs, and write nothing.
 
     Raises:
         ValueError: one is no run folder, or none says enough.
         ImportError: pyarrow is not installed.
     """
     name = "buffer-vs-learning"
-    need_parquet(name)
     folders = list(runs) or [str(e.parent) for e in sorted(Path(out).glob("*/evaluation.json"))]
     if not folders:
         raise ValueError(f"--out {out}: no evaluated run is there; name some with --runs")
     found, left_out = learned(folders)
     if not found:
         raise ValueError(f"none of these runs says enough: {'; '.join(left_out)}")
+    if dry_run:
+        print("\n".join([*(run.run for run in found), *left_out]))
+        print(f"{len(found)} of {len(folders)} runs to read: about 0 hours, nothing is played")
+        return
+    need_parquet(name)
     tasks = list(dict.fromkeys(run.task for run in found))
     ranks = [_said("of all runs", rank(found))]
     if len(tasks) > 1:
@@ -202,7 +223,8 @@ def main(runs: Sequence[str] = (), out: str = "bench") -> None:
     below = (
         "Buffer: transitions of whole successful episodes when the warm-up was over, the "
         "demonstration left out. Success: last policy, unseen episodes, Wilson's interval. "
-        f"Spearman's rank correlation of both, {'; '.join(ranks)}. "
+        "Spearman's rank correlation of both, runs with the same warm-up counted once: "
+        f"{'; '.join(ranks)}. "
         + "".join(f"Left out: {line}. " for line in left_out)
         + f"Read by {describe(('numpy', 'scipy', 'regil-sb3'))}"
     )

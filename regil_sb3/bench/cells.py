@@ -29,8 +29,10 @@ from regil_sb3.files import replacing
 
 __all__ = ["Cell", "below", "finish", "predicted_hours", "rows"]
 
-_DECIDE = ("gymnasium", "metaworld", "mujoco", "regil-sb3", "regil-wrappers")
-_SAID = ("gymnasium", "metaworld", "mujoco", "numpy", "timm", "torch", "regil-sb3")
+_SIMULATORS = {"libero": ("hf-libero", "robosuite"), "robosuite": ("robosuite",)}
+_DECIDE = ("gymnasium", "mujoco", "regil-sb3", "regil-wrappers")
+_HERE = ("metaworld", "hf-libero", "robosuite", "mujoco")  # simulators
+_SAID = ("gymnasium", *_HERE, "numpy", "timm", "torch", "regil-sb3")
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ class Cell:
     @cached_property
     def path(self) -> Path:
         """Its file: two cells with the same are the same cell."""
-        decides = json.dumps({**self.asked, "versions": _versions()}, sort_keys=True)
+        versions = _versions(str(self.asked.get("env")))
+        decides = json.dumps({**self.asked, "versions": versions}, sort_keys=True)
         return self.folder / f"{hashlib.sha256(decides.encode()).hexdigest()[:20]}.json"
 
     @property
@@ -85,9 +88,11 @@ class Cell:
         return found
 
 
-def _versions() -> dict[str, str]:
+def _versions(env: str) -> dict[str, str]:
+    """Of the packages that decide what is found in an environment."""
+    kind = env.removeprefix("regil/").partition("-")[0]
     found = {}
-    for name in _DECIDE:
+    for name in (*_DECIDE, *_SIMULATORS.get(kind, ("metaworld",))):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -39,6 +39,7 @@ _K, _HORIZON = 5, 4
 _ENVIRONMENTS = 8
 _SHIFT = 7  # frames between two environments' episodes
 _NOISE = 5.0  # std of the episode's, of 255
+_PAIR_S = 40.0  # seconds of an encoder with a demonstration, roughly
 _PACKAGES = ("numpy", "torch", "timm", "opencv-python-headless", "tslearn", "dtaidistance")
 
 _ONE = "1 environment"
@@ -289,16 +290,24 @@ def _line(row: Row) -> str:
     )
 
 
-def main(out: str = "bench", **options: Any) -> list[Row]:
+def main(out: str = "bench", dry_run: bool = False, **options: Any) -> list[Row]:
     """Measure and print, line by line.
 
     Args:
         out: folder of ``latency.md``, ``.tex`` and ``.parquet``.
+        dry_run: print what would be measured, and about how long; measure nothing.
         **options: of `latency`.
 
     Raises:
         ImportError: pyarrow is not installed.
     """
+    if dry_run:
+        encoders, frames = options.get("encoders", ENCODERS), options.get("frames", FRAMES)
+        pairs = [f"{encoder}, {length} frames" for encoder in encoders for length in frames]
+        print("\n".join(pairs))
+        hours = len(pairs) * _PAIR_S / 3600
+        print(f"{len(pairs)} pairs to measure, anew each time: about {hours:.2f} hours")
+        return []
     need_parquet("latency")
     process.set_threads()
     process.keep_freed_memory()  # as regil train does

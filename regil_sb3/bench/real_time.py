@@ -12,6 +12,7 @@ import tempfile
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -41,6 +42,7 @@ SIDES: dict[str, type[TD3BC]] = {"beside control": BackgroundTD3BC, "in turn": T
 _HERTZ = 30
 _TASKS = ("reach", "insert", "open")
 _GUIDED = 0.2  # of the steps, where that is less than the preset's
+_PICTURES: dict[str, Any] = {"jitter": 0.003, "dropped": 0.01}  # s; a share
 
 
 class _Memory(BaseCallback):
@@ -82,9 +84,7 @@ def controlled(task: str, seed: int, steps: int, side: str) -> dict[str, Any]:
     guided = min(round(_GUIDED * steps), settings.warmup_steps)
     demo = record_expert(name, seed, {"random_object": False})
     with tempfile.TemporaryDirectory() as folder:
-        env: gym.Env[Any, Any] = gym.make(
-            name, real_time=True, jitter=0.003, dropped=0.01, record_to=folder
-        )
+        env: gym.Env[Any, Any] = gym.make(name, real_time=True, **_PICTURES, record_to=folder)
         times: Any = env.unwrapped
         demo.save(at := str(Path(folder) / "demo.hdf5"))
         for wrapper, arguments in settings.wrappers(at):
@@ -161,6 +161,9 @@ def planned(
                         "seed": seed,
                         "steps": steps,
                         "updates": side,
+                        "settings": asdict(make_settings(f"regil/rehearsal-{task}-v0", seed=seed)),
+                        "pictures": _PICTURES,
+                        "guided": _GUIDED,
                     },
                     partial(_alone, task, seed, steps, side),
                     steps / _HERTZ,

@@ -2,13 +2,14 @@
 
 * ``TASKS`` - the paper's of Meta-World
 * ``guides`` - arguments of each guide that exists
-* ``env_id``, ``task_of``, ``env_kwargs``, ``check`` - environments by the names that tables take
+* ``env_id``, ``task_of``, ``benchmark``, ``env_kwargs``, ``check`` - environments by the names that
+  tables take
 * ``demonstration``, ``play``, ``follow`` - an episode of the expert's, and of a guide
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -23,6 +24,7 @@ from regil_sb3.settings import make_settings, presets
 
 __all__ = [
     "TASKS",
+    "benchmark",
     "check",
     "demonstration",
     "env_id",
@@ -66,6 +68,12 @@ def task_of(env: str) -> str:
     """The name that `env_id` makes the id of."""
     task = env.removeprefix("regil/metaworld-").removesuffix("-v0")
     return task if env_id(task) == env else env
+
+
+def benchmark(tasks: Iterable[str]) -> str:
+    """Which of the paper's benchmarks all these tasks are of; "": of none, or of several."""
+    kinds = {env_id(task).removeprefix("regil/").partition("-")[0] for task in tasks}
+    return kinds.pop() if len(kinds) == 1 and kinds <= {"metaworld", "libero"} else ""
 
 
 def env_kwargs(task: str) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from regil_sb3.bench.cells import Cell, below, finish, rows
 from regil_sb3.bench.page import need_parquet, said, write
 from regil_sb3.bench.replay import (
     TASKS,
+    benchmark,
     check,
     demonstration,
     env_id,
@@ -149,13 +150,16 @@ def successes(
 def table(plan: Planned, each_task: bool = False) -> list[str]:
     """The table in Markdown: a line a value; its cells are kept, but for those that cannot be.
 
+    The paper's figures are of Meta-World and of LIBERO; beside tasks of both there are none.
+
     Args:
         plan: of `planned`.
         each_task: whether each task has a column of its own, too.
     """
-    defaults, paper = guides()["plain"], said()["paper"]["sensitivity"]
+    defaults = guides()["plain"]
     measured = [cells for cells in plan.values() if not isinstance(cells, str)]
     tasks = list(dict.fromkeys(task_of(c.asked["env"]) for cells in measured for c in cells))
+    paper = said()["paper"]["sensitivity"].get(benchmark(tasks), {})
     columns = ["varied", "value", "success (95 %)", "episodes", "paper", *(tasks * each_task)]
     lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
     for (varied, value), cells in plan.items():
@@ -168,7 +172,7 @@ def table(plan: Planned, each_task: bool = False) -> list[str]:
                 by_task[task_of(cell.asked["env"])] += cell.found["successes"]
             outcomes = [outcome for own in by_task.values() for outcome in own]
             ours = [_rate(outcomes), str(len(outcomes))]
-        theirs = paper[varied].get(value, "-")
+        theirs = paper.get(varied, {}).get(value, "-")
         rates = [_rate(own) for own in by_task.values()] * each_task
         lines.append(f"| {' | '.join([varied, shown, *ours, str(theirs), *rates])} |")
     return lines

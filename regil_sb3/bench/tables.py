@@ -200,7 +200,7 @@ _ROOMS: dict[str, tuple[str, ...] | None] = {
     "trajectories": None,
     "real-time": None,
     "results": None,
-    "latency": ("encoders", "frames", "out"),
+    "latency": ("encoders", "frames", "out", "dry_run"),
     "memory": ("frames", "dims", "plot"),
     "index": ("frames", "dims"),
     "throughput": (),

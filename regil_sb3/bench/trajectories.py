@@ -36,6 +36,8 @@ from regil_sb3.training import make_env
 
 __all__ = ["SOURCES", "Played", "Trajectory", "main", "played", "table"]
 
+_STEP_S, _LENGTH = 0.015, 100  # seconds of a step, and steps of an episode: for predictions
+
 Points = npt.NDArray[np.float64]
 
 SOURCES = {"success buffer": "#2a9d5c", "policy": "#d1495b", "demonstration": "#1f5fa8"}
@@ -306,24 +308,33 @@ def _how(run: Played) -> str:
     )
 
 
-def main(runs: Sequence[str] = (), out: str = "bench", episodes: int = 10) -> None:
+def main(
+    runs: Sequence[str] = (), out: str = "bench", episodes: int = 10, dry_run: bool = False
+) -> None:
     """Play runs again, and print the table.
 
     Args:
         runs: folders that `regil train` or `regil bench` wrote.
         out: folder of ``trajectories.md``, ``.tex``, ``.parquet`` (a row a point) and ``.png``.
         episodes: of the policy, the first unseen ones.
+        dry_run: print the runs and the predicted hours, and play none.
 
     Raises:
         ValueError: there is no run, or one cannot be played again.
         ImportError: pyarrow is not installed.
     """
     name = "trajectories"
-    need_parquet(name)
     if not runs:
         raise ValueError("--runs is missing: name a run that has ended")
     check((), (), episodes=episodes)
     contents = [_checked(run) for run in runs]
+    if dry_run:
+        warmups = [Settings.load(run.folder / "config.yaml").warmup_steps for run in contents]
+        hours = _STEP_S * sum(warmup + episodes * _LENGTH for warmup in warmups) / 3600
+        print("\n".join(str(run.folder) for run in contents))
+        print(f"{len(contents)} runs to play: about {hours:.2f} hours, one after the other")
+        return
+    need_parquet(name)
     begun = time.perf_counter()
     found = [played(run, episodes) for run in contents]
     minutes = (time.perf_counter() - begun) / 60

@@ -8,7 +8,7 @@ import missing_weights
 import pyarrow.parquet as parquet
 import pytest
 
-from regil_sb3.bench import cells, replay, sensitivity, success_buffer
+from regil_sb3.bench import cells, page, replay, sensitivity, success_buffer
 from regil_sb3.bench.cells import Cell, below, finish, predicted_hours
 from regil_sb3.bench.machine import together
 from regil_sb3.cli import main
@@ -182,15 +182,29 @@ def test_success_buffers_have_a_deviation_over_seeds(tmp_path, monkeypatch, caps
     command = ["bench", "success-buffer", "--tasks", "hammer", "assembly", "--steps", "10"]
     command += ["--out", str(tmp_path)]
     assert main([*command, "--seeds", "0"]) == 0
-    assert "| hammer | 10 | 20 | 30 | 456 ± 147 |" in capsys.readouterr().out
+    assert "| hammer | 10 | 20 | 30 | - |" in capsys.readouterr().out  # the paper's is of 5,000
     assert main([*command, "--seeds", "0", "1", "2", "--dry-run"]) == 0
     assert "12 of 18 cells to measure" in capsys.readouterr().out
     assert main([*command, "--seeds", "0", "1", "2"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "| task | plain | moved back | corrected | paper |"
-    assert "| hammer | 20 ± 10 | 40 ± 20 | 60 ± 30 | 456 ± 147 |" in lines
+    assert "| hammer | 20 ± 10 | 40 ± 20 | 60 ± 30 | - |" in lines
     assert "| assembly | 20 ± 10 | 40 ± 20 | 60 ± 30 | - |" in lines
     assert "| **mean** | 20 | 40 | 60 | - |" in lines
+    plate = "regil/libero-kitchen1-bowl-on-plate-v0"
+    for task, steps, paper in (("hammer", 5_000, "456 ± 147"), (plate, 10_000, "3024")):
+        command[3:] = [task, "--steps", str(steps), "--out", str(tmp_path)]
+        assert main(command) == 0
+        (line,) = (x for x in capsys.readouterr().out.splitlines() if x.startswith(f"| {task} |"))
+        assert line.endswith(f" | {paper} |")
+
+
+def test_the_papers_sensitivity_is_of_one_benchmark():
+    meta, libero = ["hammer", "door-open"], ["regil/libero-study4-book-v0"]
+    told = [replay.benchmark(tasks) for tasks in (meta, libero, meta + libero, ["my/reach-v0"])]
+    assert told == ["metaworld", "libero", "", ""]
+    paper = page.said()["paper"]["sensitivity"]
+    assert [paper[name]["horizon"][4] for name in told[:2]] == [0.53, 0.47]
 
 
 def test_a_guide_that_is_followed():

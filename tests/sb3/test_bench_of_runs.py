@@ -53,24 +53,32 @@ def test_runs_that_say_too_little_are_left_out(tmp_path):
     finished(tmp_path / "unguided", 129, 19, warmup_steps=0)
     finished(tmp_path / "short", 129, 19, warmup_steps=9_000)
     (finished(tmp_path / "running", 129, 19) / "evaluation.json").unlink()
-    names = ("good", "unguided", "short", "running")
+    finished(tmp_path / "unregularised", 129, 19, bc_coef=0)
+    names = ("good", "unguided", "short", "running", "unregularised")
     found, left_out = learned([tmp_path / name for name in names])
-    assert found == [Learned(str(tmp_path / "good"), "hammer", 4, 2_000, 100, 19, 20)]
+    good = str(tmp_path / "good")
+    assert found == [Learned(good, "hammer", "default", 4, 15_000, 2_000, 100, 19, 20)]
     assert [line.rpartition(": ")[2].split(" (")[0] for line in left_out] == [
         "no guide acted in it",
         "its log does not reach the end of the warm-up",
         "its policy is not evaluated",
+        "it does not learn from the buffer",
     ]
 
 
 def test_ranks():
     def runs(pairs):
-        return [Learned("", "hammer", 0, 2_000, buffer, solved, 20) for buffer, solved in pairs]
+        same = ("", "hammer", "default", 0, 15_000, 2_000)
+        return [Learned(*same, buffer, solved, 20) for buffer, solved in pairs]
 
     grows = rank(runs([(100, 3), (200, 5), (300, 9), (5_000, 10)]))
     assert (grows.rho, grows.n) == (pytest.approx(1), 4)
     assert grows.p == pytest.approx(2 / 24)  # of 24 orders, two are as extreme
     assert rank(runs([(1, 9), (2, 5), (3, 1)])).rho == pytest.approx(-1)
+    # what had the same warm-up counts once: its mean
+    assert rank(runs([(1, 9), (2, 2), (2, 8), (3, 1), (3, 1)])) == rank(
+        runs([(1, 9), (2, 5), (3, 1)])
+    )
     for few in ([(1, 2), (2, 3)], [(1, 2), (2, 2), (3, 2)], [(1, 2), (1, 3), (1, 4)]):
         assert np.isnan(rank(runs(few)).rho)
 
@@ -81,11 +89,17 @@ def test_buffer_vs_learning_is_made_of_runs_alone(tmp_path, capsys):
     for i, (kept, solved) in enumerate([(129, 6), (329, 18), (229, 12), (1029, 19)]):
         finished(tmp_path / f"hammer-{i}", kept, solved, seed=i)
     other = finished(tmp_path / "door", 29, 20, env="regil/metaworld-door-open-v0")
+    assert main(["bench", "buffer-vs-learning", "--out", str(tmp_path), "--dry-run"]) == 0
+    assert "5 of 5 runs to read: about 0 hours" in capsys.readouterr().out
+    assert not list(tmp_path.glob("buffer*"))
     assert main(["bench", "buffer-vs-learning", "--out", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[2].startswith("| hammer | 3 | 2000 | 1000 | 0.95 (0.76 to 0.99) |")
-    assert lines[-3].startswith("| door-open | 0 | 2000 | 0 | 1.00 ")
-    assert "of all runs: +0.00 (p 1.000) of 5; door-open: none, of 1; hammer: +1.00" in lines[-1]
+    assert lines[2].startswith(
+        "| hammer | default | 3 | 15000 | 2000 | 1000 | 0.95 (0.76 to 0.99) |"
+    )
+    assert lines[-3].startswith("| door-open | default | 0 | 15000 | 2000 | 0 | 1.00 ")
+    assert "of all runs: +0.00 (p 1.000) of 5 warm-ups; door-open: none, of 1 warm-ups" in lines[-1]
+    assert "; hammer: +1.00" in lines[-1]
     rows = parquet.read_table(tmp_path / "buffer-vs-learning.parquet").to_pylist()
     assert [row["buffer"] for row in rows] == [0, 100, 300, 200, 1000]
     assert (tmp_path / "buffer-vs-learning.png").stat().st_size > 5_000
