@@ -1,4 +1,4 @@
-"""`regil doctor` on a demonstration of Meta-World's button-press, and on it spoilt in six ways.
+"""`regil doctor` on a demonstration of Meta-World's button-press, on it spoilt, and on two others.
 
 Prints the table of docs/doctor.md: python docs/doctor_cases.py [EPISODES]
 """

@@ -23,7 +23,11 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("env", help="id of the environment, e.g. regil/metaworld-button-press-v0")
     record.add_argument("-o", "--out", type=Path, help="file (demos/<id after the slash>.hdf5)")
     record.add_argument("--seed", type=int, default=0, help="first seed to try (0)")
-    record.add_argument("--size", type=int, help="height and width of the frames (84)")
+    record.add_argument(
+        "--size",
+        type=int,
+        help="height and width of the frames (the environment's own: 84, LIBERO 128)",
+    )
     record.add_argument(
         "--encoder-size", type=int, help="keep larger frames of this size for the encoder too"
     )
@@ -84,7 +88,7 @@ def _parser() -> argparse.ArgumentParser:
         "--episodes", type=int, default=5, help="guided episodes, plain and corrected each (5)"
     )
     doctor.add_argument("--image", help="where pictures come from: obs, obs:KEY or render (obs)")
-    doctor.add_argument("--preset", help="a section of zoo_configs/td3bc.yml")
+    doctor.add_argument("--preset", help="a section of zoo_configs/td3bc.yml or baselines.yml")
     doctor.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="as for train"
     )
@@ -115,12 +119,15 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="any argument of the algorithm or of the retrieval wrappers, or env_kwargs.NAME",
+        help="any argument of the algorithm or of the retrieval wrappers; env_kwargs.NAME, "
+        "policy_kwargs.NAME; n_envs, frame_stack, policy, eval_episodes, eval_freq",
     )
 
-    evaluate = commands.add_parser("evaluate", help="evaluate policy, guided replay and BC")
+    evaluate = commands.add_parser(
+        "evaluate", help="evaluate policy, best policy, both guides and BC"
+    )
     evaluate.add_argument("run", type=Path)
-    evaluate.add_argument("--episodes", type=int, default=40)
+    evaluate.add_argument("--episodes", type=int, default=40, help="unseen episodes of each (40)")
     evaluate.add_argument(
         "--trust",
         action="store_true",
@@ -156,7 +163,8 @@ def _parser() -> argparse.ArgumentParser:
         "--tasks",
         nargs="+",
         metavar="TASK",
-        help="Meta-World's (the paper's 7); real-time: reach, insert, open (reach)",
+        help="Meta-World's, or ids of environments (the paper's 7; training runs: those of "
+        "zoo_configs/tables.yml); real-time: reach, insert, open (reach)",
     )
     bench.add_argument(
         "--seeds", nargs="+", type=int, help="of demonstrations and runs (0 1, or 0)"
@@ -179,7 +187,7 @@ def _parser() -> argparse.ArgumentParser:
         "--encoders",
         nargs="+",
         metavar="NAME",
-        help="latency: (those at hand); sensitivity: (the paper's, and two more)",
+        help="latency: (pixels, efficientnet-lite0); sensitivity: (the paper's, and two more)",
     )
     bench.add_argument(
         "--frames", nargs="+", type=int, help="latency, memory, index: sizes of memory"

@@ -22,8 +22,9 @@ from regil_sb3.td3bc import TD3BC
 __all__ = ["SHARED", "push", "write_card"]
 
 SHARED = (
-    *("README.md", "config.yaml", "model.zip", "best_model.zip", "demo.hdf5", "calibration.json"),
-    *("evaluation.json", "episode.hdf5", "report.html", "progress.csv", "events.out.tfevents.*"),
+    *("README.md", "config.yaml", "model.zip", "best_model.zip", "bc_model.zip"),
+    *("demo.hdf5", "calibration.json", "evaluation.json", "episode.hdf5", "report.html"),
+    *("progress.csv", "events.out.tfevents.*"),
 )
 """The files of a run folder that ``push`` uploads."""
 

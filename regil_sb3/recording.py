@@ -131,7 +131,8 @@ class Recorder:
             frames; None keeps none.
 
     Raises:
-        ValueError: where actions are not continuous, or there are no pictures.
+        ValueError: where actions are not continuous, there are no pictures, or ``encoder_frame``
+            is all that draws them and no ``image_size`` is declared.
     """
 
     def __init__(self, env: gym.Env[Any, Any], encoder_frame_size: int | None = None) -> None:
@@ -149,6 +150,12 @@ class Recorder:
         draws = hasattr(self._ours, "encoder_frame")
         if encoder_frame_size is not None and not draws:
             raise ValueError(f"{name} draws no larger pictures (no encoder_frame())")
+        ours = self._ours.metadata.get("regil") or {}
+        if draws and not (self._pixels or self._keys or "image_size" in ours):
+            raise ValueError(
+                f"{name} draws its pictures (encoder_frame) but does not say in which size: "
+                'declare metadata["regil"]["image_size"] = [HEIGHT, WIDTH]'
+            )
         if not (self._pixels or self._keys or draws or env.render_mode == "rgb_array"):
             raise ValueError(
                 f"{name} gives no pictures: make it with --env-kwargs render_mode=rgb_array"

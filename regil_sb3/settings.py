@@ -205,7 +205,9 @@ def make_settings(
         seed: see ``Settings``.
         steps: agent steps; None takes the preset's.
         overrides: "KEY=VALUE" with VALUE as YAML. KEY is an argument of the algorithm or of the
-            retrieval wrappers, one of the settings above, or ``env_kwargs.NAME``.
+            retrieval wrappers, ``env_kwargs.NAME``, ``policy_kwargs.NAME``, or ``n_timesteps``
+            (steps), ``n_envs``, ``frame_stack``, ``policy``, ``eval_episodes`` or ``eval_freq`` of
+            ``Settings``.
 
     Raises:
         ValueError: an unknown preset or key.

@@ -240,7 +240,8 @@ def has_learned(run: Path, settings: Settings) -> bool:
 def resume(run: Path) -> Settings:
     """Go on with a run that was interrupted, wherever it was, as if it had not been.
 
-    One that learns from the demonstration alone goes on where Ctrl-C stopped it.
+    One that learns from the demonstration alone has no checkpoints: it goes on from the model that
+    Ctrl-C or an evaluation saved last, or begins anew.
 
     Raises:
         ValueError: no run, or one that has ended already.

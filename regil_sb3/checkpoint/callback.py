@@ -46,9 +46,9 @@ class CheckpointCallback(BaseCallback):
     """Saves all that decides how learning goes on, so that it may be killed at any moment.
 
     Going on from a checkpoint, `TD3BC` learns to the last bit what it would have learned without
-    the interruption, where each environment is wrapped in `ReplayableEpisode` (regil_sb3.
-    open_episode) and its episodes follow from its generator and the actions. Else the open episodes
-    are ended as truncated, and a warning says so.
+    the interruption, where each environment is wrapped in `ReplayableEpisode`
+    (regil_sb3.checkpoint.open_episode) and its episodes follow from its generator and the actions.
+    Else the open episodes are ended as truncated, and a warning says so.
 
     SIGTERM (a scheduler's preemption) and Ctrl-C save after the step that is under way, and end in
     `Preempted` (exit status 75) or KeyboardInterrupt. What takes longer than ``grace`` is broken

@@ -375,7 +375,7 @@ def main(
         demo: the demonstration's file.
         episodes: of the guide, plain and corrected each.
         overrides: "KEY=VALUE", as of `make_settings`.
-        preset: a section of ``zoo_configs/td3bc.yml``.
+        preset: a section of ``zoo_configs/td3bc.yml`` or ``baselines.yml``.
         html: file of the page; None writes none.
         encoders: as of `examine`.
 

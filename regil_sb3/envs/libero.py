@@ -36,7 +36,7 @@ class LiberoEnv(OSCEnv, EzPickle):
     Registered as `regil/libero-<suite>-<task>-v0`, with the suites 90, 10, spatial, object and
     goal, and under the short names of `SHORT_LIBERO_TASKS`. An action moves the hand: translation
     along the axes of the world (first three dimensions; a step of 1 asks for 5 cm, of which about
-    1 is made in its 50 ms), rotation about them (next three; 1 asks for half a radian), and the
+    1.3 are made in its 50 ms), rotation about them (next three; 1 asks for half a radian), and the
     gripper (last; positive closes). The reward is 1 where LIBERO's own predicate holds, else 0.
     Success terminates; after `max_steps` agent steps the episode is truncated.
     `info["is_success"]` is there on every step.

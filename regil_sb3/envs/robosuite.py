@@ -36,11 +36,11 @@ class RobosuiteEnv(OSCEnv, EzPickle):
     """A task of robosuite's for one arm, and success as the end of the episode.
 
     Registered as `regil/robosuite-<task>-<robot>-v0`. An action moves the hand: translation along
-    the axes of the world (first three dimensions; a step of 1 asks for 5 cm, of which about 1 is
-    made in its 50 ms), rotation about them (next three; 1 asks for half a radian), and the gripper
-    (last; positive closes; wipe has none). The reward is 1 where robosuite's own check of success
-    holds, else 0. Success terminates; after `max_steps` agent steps the episode is truncated.
-    `info["is_success"]` is there on every step.
+    the axes of the world (first three dimensions; a step of 1 asks for 5 cm, of which a Panda makes
+    about 1.3 in its 50 ms), rotation about them (next three; 1 asks for half a radian), and the
+    gripper (last; positive closes; wipe has none). The reward is 1 where robosuite's own check of
+    success holds, else 0. Success terminates; after `max_steps` agent steps the episode is
+    truncated. `info["is_success"]` is there on every step.
 
     Objects and the arm's joints are placed as robosuite places them, from the generator that
     `reset(seed=)` seeds. What robosuite draws once, such as the size of Lift's cube, is the same

@@ -19,8 +19,10 @@ class Limits:
         high: largest x, y, z (m).
         delta: how far an action of 1 moves the hand along an axis (m).
         speed: of the hand at most (m/s).
-        lead: how far a place that is asked for may be from where the hand is (m): an arm that is
-            held back by what it touches pushes no harder than that.
+        lead: how far a place that is asked for may be from where the hand is, along each axis (m):
+            an arm that is held back by what it touches pushes no harder than that. It comes after
+            the box: a hand that was pushed out of it is brought back gradually, and until then
+            places that are asked for may lie outside, too.
 
     Raises:
         ValueError: the box is empty, or a number is not positive.

@@ -156,7 +156,7 @@ def test_pushed_and_used_as_the_card_says(run, hub, capsys):
     for name, content in hub.files.items():
         assert content == (run / name).read_bytes()
     left = {path.name for path in run.iterdir()} - set(hub.files)
-    assert left == {".lock", "bc_model.zip", "success_buffer.npz"}
+    assert left == {".lock", "success_buffer.npz"}
     card = hub.files["README.md"].decode()
     (code,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
     assert REPO in code

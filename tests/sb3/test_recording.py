@@ -163,6 +163,23 @@ def test_frames_are_one_picture_and_no_more():
         as_seen(with_state, gym.spaces.Dict(x=state, state=state), TwoCameras.action_space, 1)
 
 
+def test_pictures_of_no_declared_size_get_one_line():
+    class Draws(Patient):
+        observation_space = gym.spaces.Box(0, 9, (1,), np.float32)
+
+        def encoder_frame(self, size):
+            return np.zeros((size, size, 3), np.uint8)
+
+    for own in ({}, {"regil": {"camera": "front"}}):
+        Draws.metadata = own
+        with pytest.raises(ValueError, match=r"^Draws draws its pictures .*image_size"):
+            Recorder(Draws())
+    Draws.metadata = {"regil": {"image_size": [8, 8]}}
+    recorder = Recorder(Draws())
+    recorder.begin(0)
+    assert recorder.frames[0].shape == (8, 8, 3)
+
+
 def test_environment_without_an_expert_gets_one_line():
     with pytest.raises(ValueError, match=r"^Pendulum-v1 has no scripted expert"):
         record_expert("Pendulum-v1")

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -170,6 +172,20 @@ def test_strap_always_has_a_path() -> None:
 def test_bad_settings(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Retriever(Demonstration(pictures([0, 1, 2, 3, 4, 5])), **settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("demo", "named"),
+    [
+        ("demos/reach.hdf5", "'demos/reach.hdf5'"),
+        (Path("demos"), "PosixPath"),
+        ([Demonstration(pictures([0, 1, 2, 3, 4])), "reach.hdf5"], "'reach.hdf5'"),
+        (None, "None"),
+    ],
+)
+def test_only_demonstrations(demo: object, named: str) -> None:
+    with pytest.raises(ValueError, match=f"^demo={named}.*Demonstration.load opens a file$"):
+        Retriever(demo)  # type: ignore[arg-type]
 
 
 def test_frames_of_another_shape() -> None:

@@ -62,8 +62,21 @@ class _Files(Sequence[Demonstration]):
 
 
 def outlines(demos: Sequence[Demonstration]) -> list[Outline]:
-    """What is known of each without its pictures: of files only the first is read whole."""
-    return demos.outlines if isinstance(demos, _Files) else [demo.outline for demo in demos]
+    """What is known of each without its pictures: of files only the first is read whole.
+
+    Raises:
+        ValueError: if they are not demonstrations.
+    """
+    if isinstance(demos, _Files):
+        return demos.outlines
+    several = isinstance(demos, Sequence) and not isinstance(demos, str)
+    for demo in demos if several else [demos]:
+        if not isinstance(demo, Demonstration):
+            raise ValueError(
+                f"demo={demo!r}: give a Demonstration, or a list of several; "
+                "Demonstration.load opens a file"
+            )
+    return [demo.outline for demo in demos]
 
 
 def as_given(demo: Demonstrations) -> str | Demonstration | list[str | Demonstration]:

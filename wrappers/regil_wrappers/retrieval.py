@@ -42,7 +42,8 @@ class Alignment:
         cost: D(H+1, j*), summed along the path, in squared units of the embedding; >= 0.
         candidates: those of the k frames nearest to the current one that are of this demonstration,
             ascending.
-        q_star: the last of them; end <= q_star.
+        q_star: the last of them, but with step_pattern "strap" at least window // 2, without which
+            it might have no path; end <= q_star.
         window: how many recent frames were aligned: 1 at reset, growing to H + 1.
         demonstration: which one of several, 0-based.
     """
@@ -81,7 +82,7 @@ class Retriever:
         [0, 1, 1, 1, 1]
 
     Args:
-        demo: the demonstration, or a sequence of several.
+        demo: the demonstration, or a sequence of several; `Demonstration.load` opens a file.
         encoder: a name of `regil_wrappers.encoders.encoder_names()`, or an object with
             ``encode(frames: uint8 (B, H, W, 3)) -> float32 (B, D)``.
         k: how many nearest frames are candidates.
@@ -97,8 +98,8 @@ class Retriever:
         memory: the embedded demonstrations (`regil_wrappers.memory.Memory`).
 
     Raises:
-        ValueError: if a demonstration is shorter than horizon + 1 frames, or an argument is out of
-            range.
+        ValueError: if a demonstration is none or shorter than horizon + 1 frames, or an argument is
+            out of range.
         ImportError: if Faiss is asked for and not installed.
     """
 
@@ -114,8 +115,8 @@ class Retriever:
         deadline_ms: float | None = None,
     ) -> None:
         demos = [demo] if isinstance(demo, Demonstration) else demo
-        labels = None if len(demos) == 1 else [f"demonstration {i}" for i in range(len(demos))]
         lengths = [outline.shape[0] for outline in outlines(demos)]
+        labels = None if len(demos) == 1 else [f"demonstration {i}" for i in range(len(demos))]
         check_settings(lengths, k, horizon, step_pattern, labels, search)
         self.latency = Latency(deadline_ms)
         encoder = make_encoder(encoder) if isinstance(encoder, str) else encoder
