@@ -13,7 +13,7 @@ import html
 from collections.abc import Sequence
 from pathlib import Path
 
-from regil_sb3.bench.run_tables import LEARNING
+from regil_sb3.bench.run_tables import LEARNING, planned
 from regil_sb3.files import replacing
 from regil_sb3.report.comparison import NOTE, plots, scores
 from regil_sb3.report.page import card, write_page
@@ -57,14 +57,19 @@ def main(out: str = "bench", page: str = "docs/results.md") -> None:
     for name, text in texts.items():
         if text.count("\n\n") != 2:
             raise ValueError(f"{found[name]} is no table: remove it, and it is made again")
-    missing = [f"regil bench {name}{words}" for name, words in KEPT.items() if name not in found]
+    absent = [name for name in KEPT if name not in found]
+    missing = {f"regil bench {name}{KEPT[name]}": "not measured yet" for name in absent}
+    for name in (name for name in LEARNING if name in found):
+        runs = planned(name, out)
+        if todo := [run for run in runs if not run.finished]:
+            missing[f"regil bench {name}"] = f"{len(todo)} of its {len(runs)} runs are not there"
     written = f"Written by `regil bench results --out {out}`, from the tables that are kept there."
     parts = ["# Results", written]
     parts += [f"## {name}\n\n{text}" for name, text in texts.items()]
     if missing:
-        lines = [f"* `{command}`" for command in missing]
+        lines = [f"* `{command}`: {why}" for command, why in missing.items()]
         parts.append("\n".join(["## Not measured yet", "", *lines]))
-    cards, gone = [], [f"{command}: not measured yet" for command in missing]
+    cards, gone = [], [f"{command}: {why}" for command, why in missing.items()]
     for name, text in texts.items():
         learned = name.startswith(LEARNING)
         drawn, lacking = _learning(Path(out), name) if learned else ("", [])
@@ -74,7 +79,7 @@ def main(out: str = "bench", page: str = "docs/results.md") -> None:
     with replacing(markdown) as file:
         file.write(("\n\n".join(parts) + "\n").encode())
     write_page(markdown.with_suffix(".html"), "ReGIL: results", "", "".join(cards), NOTE, gone)
-    print(f"{page}: {', '.join(found)}" + (f"; {len(missing)} not there yet" if missing else ""))
+    print(f"{page}: {', '.join(found)}" + (f"; {len(absent)} not there yet" if absent else ""))
 
 
 def _written(out: Path, name: str) -> list[Path]:
