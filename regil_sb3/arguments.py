@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 
 _CHOICES = {
     "bc_loss": ("mse", "nll"),
@@ -83,6 +84,21 @@ def _check_train_freq(train_freq: Any) -> str:
     if unit not in ("step", "episode"):
         raise ValueError(f"train_freq counts in {unit!r}: use 'step' or 'episode'")
     return unit
+
+
+def check_action_space(name: str, env: Any) -> None:
+    """Refuse an environment whose actions are no Box with finite limits, in one line.
+
+    Args:
+        name: of the algorithm.
+        env: the environment; only its id says nothing yet.
+
+    Raises:
+        ValueError: naming the space.
+    """
+    space = getattr(env, "action_space", None)
+    if space is not None and not (isinstance(space, spaces.Box) and space.is_bounded()):
+        raise ValueError(f"the action space is {space}: {name} needs a Box with finite limits")
 
 
 def check_device(device: Any) -> None:

@@ -240,8 +240,8 @@ class Recorder:
             metadata={
                 **{name: ours[name] for name in kept if name in ours},
                 "env_id": env_id,
-                "action_low": self.space.low.tolist(),
-                "action_high": self.space.high.tolist(),
+                "action_low": _limits(self.space.low),
+                "action_high": _limits(self.space.high),
                 "seed": self.seed,
                 # only what took part in this recording
                 "versions": {
@@ -252,6 +252,11 @@ class Recorder:
                 **metadata,
             },
         )
+
+
+def _limits(values: npt.NDArray[np.floating[Any]]) -> list[float] | None:
+    """As metadata holds them: None where not all are finite."""
+    return values.tolist() if np.isfinite(values).all() else None
 
 
 def is_picture(space: gym.Space[Any]) -> bool:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 from zipfile import BadZipFile
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 import torch as th
@@ -29,11 +28,11 @@ from stable_baselines3.common.type_aliases import (
     TrainFreq,
 )
 from stable_baselines3.common.utils import polyak_update, safe_mean
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
 from stable_baselines3.td3.policies import MlpPolicy, MultiInputPolicy, TD3Policy
 from torch.nn import functional as F  # noqa: N812
 
-from regil_sb3.arguments import check_arguments
+from regil_sb3.arguments import check_action_space, check_arguments
 from regil_sb3.as_seen import as_seen
 from regil_sb3.bc_schedule import BySuccess, by_time
 from regil_sb3.collection import Collection
@@ -190,8 +189,7 @@ class TD3BC(SafeLoad, TD3):
         _init_setup_model: bool = True,
     ) -> None:
         check_arguments(locals())
-        if isinstance(env, gym.Env | VecEnv) and not isinstance(env.action_space, spaces.Box):
-            raise ValueError(f"the action space is {env.action_space}: TD3BC needs a Box")
+        check_action_space("TD3BC", env)
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
         self.warmup_steps, self.guide_again = warmup_steps, guide_again
         self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps

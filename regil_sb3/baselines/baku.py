@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
 from torch import nn
 from torch.nn import functional as F  # noqa: N812
 
-from regil_sb3.arguments import check_device, check_number
+from regil_sb3.arguments import check_action_space, check_device, check_number
 from regil_sb3.as_seen import as_seen
 from regil_sb3.baselines.offline import Offline
 from regil_sb3.model_file import SafeLoad
@@ -263,6 +263,7 @@ class BAKU(SafeLoad, Offline):
         if not callable(learning_rate):
             check_number("learning_rate", learning_rate, (int, float), 0.0, np.inf)
         check_device(device)
+        check_action_space("BAKU", env)
         super().__init__(
             policy,
             env,

@@ -195,6 +195,7 @@ COMMANDS = [
     (setting("eval_freq=0"), "eval_freq"),
     (setting("env_kwargs.colour=red"), "colour"),
     (setting("env_kwargs.action_high=high"), "action_high"),
+    (setting("env_kwargs.action_high=.inf"), "Box(-inf, inf, (2,), float32)"),
     # afterwards
     (["evaluate", "nowhere"], "nowhere"),
     (["evaluate", "run"], "run"),

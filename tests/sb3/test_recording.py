@@ -180,6 +180,18 @@ def test_pictures_of_no_declared_size_get_one_line():
     assert recorder.frames[0].shape == (8, 8, 3)
 
 
+def test_limits_that_are_not_finite_are_unknown():
+    env = Patient()
+    env.action_space = gym.spaces.Box(-1, np.inf, (2,), np.float32)
+    recorder = Recorder(env)
+    recorder.begin(3)
+    recorder.step(np.array([-3, 3], np.float32))
+    demo = recorder.demonstration("Patient-v0")
+    assert demo.actions.tolist() == [[-1, 3]]
+    assert demo.metadata["action_low"] == [-1, -1]
+    assert demo.metadata["action_high"] is None
+
+
 def test_environment_without_an_expert_gets_one_line():
     with pytest.raises(ValueError, match=r"^Pendulum-v1 has no scripted expert"):
         record_expert("Pendulum-v1")
