@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -271,6 +272,9 @@ def _record_as_asked(args: argparse.Namespace) -> None:
             pass  # a person takes its place
     from regil_sb3.teleoperation import teleoperate
 
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch(exist_ok=False)  # what cannot be written is said before a person's work
+    path.unlink()
     device = args.teleop or "keyboard"
     try:
         demo = teleoperate(args.env, device, args.seed, env_kwargs, args.encoder_size, args.live)
@@ -281,7 +285,12 @@ def _record_as_asked(args: argparse.Namespace) -> None:
     if demo is None:
         print("nothing was recorded", file=sys.stderr)
         return
-    demo.save(path)
+    try:
+        demo.save(path)
+    except OSError as error:
+        kept = Path(tempfile.mkdtemp(prefix="regil-")) / path.name
+        demo.save(kept)
+        raise OSError(f"{path} cannot be written ({error}): the recording is {kept}") from error
     print(f"{path}: {len(demo)} frames, seed {demo.metadata['seed']}")
 
 

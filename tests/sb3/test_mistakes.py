@@ -102,6 +102,7 @@ COMMANDS = [
     (["record", "not an id", "-o", "x.hdf5"], "not an id"),
     (["record", TOY, "-o", "x.hdf5"], "no scripted expert"),
     (["record", TOY, "-o", "x.hdf5", "--teleop", "keyboard"], "no window can be opened"),
+    (["record", TOY, "-o", "file/x.hdf5", "--teleop", "keyboard"], "file"),
     (["record", TOY, "-o", "good.hdf5"], "exists already"),
     (["record", TOY, "-o", "x.hdf5", "--env-kwargs", "size"], "KEY=VALUE"),
     (["record", TOY, "-o", "x.hdf5", "--env-kwargs", "sice=3"], "sice"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -132,6 +133,26 @@ def test_giving_up_keeps_nothing(tmp_path, monkeypatch, capsys):
     assert main(["record", ENV, "--teleop", "keyboard", "-o", str(path)]) == 0
     assert "nothing was recorded" in capsys.readouterr().err
     assert not path.exists()
+
+
+def test_what_cannot_be_written_is_kept_elsewhere(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "demo.hdf5"
+
+    def full(demo, target, save=Demonstration.save):
+        if target == path:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(demo, target)
+
+    person = Person(*TO_HOME, [], press(pg.K_RETURN))
+    monkeypatch.setattr("regil_sb3.teleoperation.window.Window.clock", lambda self: person)
+    monkeypatch.setattr(Demonstration, "save", full)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    words = ["record", ENV, "--teleop", "keyboard", "-o", str(path), "--env-kwargs", "frozen=true"]
+    assert main(words) == 2
+    assert not path.exists()
+    (kept,) = tmp_path.rglob("demo.hdf5")
+    assert str(kept) in capsys.readouterr().err
+    assert len(Demonstration.load(kept)) == 28
 
 
 def test_time_that_is_over_is_no_success():
