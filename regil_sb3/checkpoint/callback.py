@@ -20,6 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from regil_sb3 import __version__
@@ -32,6 +33,7 @@ from regil_sb3.watch import require_finite_parameters
 __all__ = ["CheckpointCallback", "Preempted"]
 
 TRY_AGAIN = 75  # EX_TEMPFAIL of sysexits.h
+_LOGGED = (str, bool, int, float, np.number, np.bool_)
 _SHARE = 0.05  # of the time, at most, goes into saving
 
 
@@ -163,15 +165,15 @@ class CheckpointCallback(BaseCallback):
     def _save(self, model: TD3BC) -> None:
         require_finite_parameters(model)
         has_log = self.log is not None and self.log.exists()
+        # Figures, films and hyperparameters that are not yet logged are not kept
+        logged = {k: v for k, v in self.logger.name_to_value.items() if isinstance(v, _LOGGED)}
+        counts = {k: n for k, n in self.logger.name_to_count.items() if k in logged}
         self._saving = True
         try:
             self.generations.save(
                 {
                     "learner": learner_state(model),
-                    "logger": [
-                        dict(self.logger.name_to_value),
-                        dict(self.logger.name_to_count),
-                    ],
+                    "logger": [logged, counts],
                     "log": self.log.read_text(encoding="utf-8") if self.log and has_log else None,
                 }
             )

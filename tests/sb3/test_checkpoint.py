@@ -18,6 +18,7 @@ import pytest
 import torch as th
 from at_step import At
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import HParam, Video
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from toy import Reach
@@ -266,6 +267,27 @@ def test_what_takes_too_long_is_broken_off(tmp_path):
     with pytest.raises(Preempted):
         new_model(toy()).learn(STEPS, [checkpoints, Hang()])
     assert CheckpointCallback(tmp_path).restore(new_model(toy())) == 80
+
+
+def test_what_only_tensorboard_takes_is_not_kept(tmp_path):
+    """As SB3's documentation logs hyperparameters and figures."""
+
+    class Log(BaseCallback):
+        def _on_training_start(self):
+            hparams = HParam({"gamma": self.model.gamma}, {"rollout/ep_len_mean": 0.0})
+            self.logger.record("hparams", hparams, exclude=("stdout", "log", "json", "csv"))
+
+        def _on_step(self):
+            self.logger.record("film", Video(th.zeros(1, 1, 3, 2, 2), fps=1))
+            self.logger.record("note", "text")
+            self.logger.record_mean("mean", np.float32(self.num_timesteps))
+            return True
+
+    checkpoints = CheckpointCallback(tmp_path, steps=5)
+    new_model(toy()).learn(7, [Log(), checkpoints])
+    again = CheckpointCallback(tmp_path)
+    assert again.restore(new_model(toy())) == 5
+    assert again._pending == [{"note": "text", "mean": 3.0}, {"mean": 5}]
 
 
 def test_a_removed_folder_is_noticed_and_training_goes_on(tmp_path):
