@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 
 from regil_sb3 import __version__
 from regil_sb3.background import BackgroundTD3BC
@@ -33,7 +34,7 @@ from regil_sb3.watch import require_finite_parameters
 __all__ = ["CheckpointCallback", "Preempted"]
 
 TRY_AGAIN = 75  # EX_TEMPFAIL of sysexits.h
-_LOGGED = (str, bool, int, float, np.number, np.bool_)
+_KEPT = (str, bool, int, float, np.number, np.bool_)
 _SHARE = 0.05  # of the time, at most, goes into saving
 
 
@@ -166,14 +167,17 @@ class CheckpointCallback(BaseCallback):
         require_finite_parameters(model)
         has_log = self.log is not None and self.log.exists()
         # Figures, films and hyperparameters that are not yet logged are not kept
-        logged = {k: v for k, v in self.logger.name_to_value.items() if isinstance(v, _LOGGED)}
-        counts = {k: n for k, n in self.logger.name_to_count.items() if k in logged}
+        values = self.logger.name_to_value.items()
+        names = {name for name, value in values if isinstance(value, _KEPT)}
         self._saving = True
         try:
             self.generations.save(
                 {
                     "learner": learner_state(model),
-                    "logger": [logged, counts],
+                    "logger": [
+                        {name: value for name, value in part.items() if name in names}
+                        for part in _logged(self.logger)
+                    ],
                     "log": self.log.read_text(encoding="utf-8") if self.log and has_log else None,
                 }
             )
@@ -189,8 +193,8 @@ class CheckpointCallback(BaseCallback):
         if self.num_timesteps < self._reached:
             self._tried_at, self._began_anew = self.num_timesteps, True
         if self._pending:
-            self.logger.name_to_value.update(self._pending[0])
-            self.logger.name_to_count.update(self._pending[1])
+            for part, kept in zip(_logged(self.logger), self._pending, strict=False):
+                part.update(kept)  # older checkpoints hold two parts
             self._pending = []
         self._next = time.monotonic() + self.seconds
         if threading.current_thread() is threading.main_thread():
@@ -274,3 +278,8 @@ class CheckpointCallback(BaseCallback):
     @staticmethod
     def _end(number: int) -> BaseException:
         return KeyboardInterrupt() if number == signal.SIGINT else Preempted()
+
+
+def _logged(logger: Logger) -> list[dict[str, Any]]:
+    """What it has been given and has not written yet."""
+    return [logger.name_to_value, logger.name_to_count, logger.name_to_excluded]

@@ -18,7 +18,7 @@ import pytest
 import torch as th
 from at_step import At
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import HParam, Video
+from stable_baselines3.common.logger import HParam, Video, configure
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from toy import Reach
@@ -287,7 +287,22 @@ def test_what_only_tensorboard_takes_is_not_kept(tmp_path):
     new_model(toy()).learn(7, [Log(), checkpoints])
     again = CheckpointCallback(tmp_path)
     assert again.restore(new_model(toy())) == 5
-    assert again._pending == [{"note": "text", "mean": 3.0}, {"mean": 5}]
+    values, counts, excluded = again._pending
+    assert (values, counts) == ({"note": "text", "mean": 3.0}, {"mean": 5})
+    assert excluded.keys() == values.keys()
+
+
+def test_what_was_logged_before_is_written_after(tmp_path):
+    """TensorBoard's log, of SB3, wants to know of each value which logs leave it out."""
+    once = At(3, lambda: model.logger.record("once", 1.0, exclude="csv"))
+    model = new_model(toy())
+    model.learn(7, [once, CheckpointCallback(tmp_path, steps=5)])
+    again, checkpoints = new_model(toy()), CheckpointCallback(tmp_path)
+    again.set_logger(configure(str(tmp_path / "log"), ["tensorboard", "csv"]))
+    checkpoints.restore(again)
+    again.learn(20, [checkpoints, At(7, again.dump_logs)], reset_num_timesteps=False)
+    again.logger.close()
+    assert "once" not in (tmp_path / "log" / "progress.csv").read_text().splitlines()[0]
 
 
 def test_a_removed_folder_is_noticed_and_training_goes_on(tmp_path):
