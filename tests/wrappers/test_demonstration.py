@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -310,6 +313,24 @@ def test_an_interrupted_save_leaves_the_old_file(
         Demonstration(FRAMES).save(path)
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_the_file_that_is_written_reaches_the_disk(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the descriptor that wrote it: Windows refuses those that are open for reading alone."""
+    synced = []
+
+    def fsync(descriptor: int, real: Any = os.fsync) -> None:
+        if not stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            if fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+                raise OSError(errno.EBADF, "Bad file descriptor")
+            synced.append(descriptor)
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    Demonstration(FRAMES).save(path)
+    assert len(synced) == 1
 
 
 def test_saved_files_are_as_readable_as_any_new_file(path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,31 @@ def test_round_trips_are_exact(name: str, tmp_path: Path) -> None:
     assert provenance == [] if name == "regil" else provenance[0]["read"] == name
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
     assert formats.detect(path) == ("regil" if name == "robomimic" else name)
+
+
+FULL_DISK = """
+import resource, sys
+import numpy as np
+from regil_wrappers import Demonstration, formats
+frames = np.random.default_rng(0).integers(0, 256, (20, 64, 64, 3), np.uint8)
+demo = Demonstration(frames, np.zeros((19, 2), np.float32), metadata={"control_rate": 10})
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+try:
+    formats.write(demo, sys.argv[2], sys.argv[1])
+except OSError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("name", [name for name in EXACT if name != "pictures"])
+def test_a_full_disk_is_one_line_and_leaves_nothing(name: str, tmp_path: Path) -> None:
+    """In a process of its own: HDF5 may crash."""
+    words = [sys.executable, "-c", FULL_DISK, name, str(out(tmp_path, name))]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "File too large" in done.stdout
+    assert len(done.stdout.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["mp4", "gif"])

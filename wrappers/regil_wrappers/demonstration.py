@@ -33,7 +33,6 @@ written by `regil_wrappers.formats`.
 
 from __future__ import annotations
 
-import io
 import json
 import os
 from collections.abc import Iterator
@@ -180,16 +179,13 @@ class Demonstration:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        memory = io.BytesIO()  # HDF5 may crash the process when it writes to a full disk
-        with h5py.File(memory, "w") as file:
-            self._write(file)
         try:
-            temporary.write_bytes(memory.getbuffer())
-            _sync(temporary)
+            with hdf5.created(temporary) as file:
+                self._write(file)
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
-        _sync(path.parent)
+        _sync_folder(path.parent)
 
     def _write(self, file: h5py.File) -> None:
         n = len(self.frames)
@@ -268,9 +264,9 @@ class Demonstration:
 _RESERVED = (_FRAMES, _ENCODER_FRAMES)
 
 
-def _sync(path: Path) -> None:
+def _sync_folder(path: Path) -> None:
     """Make a renamed file survive a power cut."""
-    if os.name == "nt" and path.is_dir():
+    if os.name == "nt":
         return  # Windows cannot open a folder
     descriptor = os.open(path, os.O_RDONLY)
     try:

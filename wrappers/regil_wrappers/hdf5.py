@@ -1,8 +1,9 @@
-"""The door through which HDF5 files come in: checked before they are read, never executed.
+"""The door of HDF5 files: those that come in are checked before they are read, never executed.
 
 Everything stays in the one file: soft, external and user-defined links, virtual datasets and
 external storage are refused. Only deflate, lzf, shuffle and fletcher32 are unpacked, each once.
 
+* ``created`` - a new file
 * ``opened`` - the file
 * ``has``, ``member`` - an object stored under a name in it
 * ``array``, ``shape`` - a numeric dataset, once its claim fits a `Budget`, or only its shape
@@ -12,8 +13,10 @@ external storage are refused. Only deflate, lzf, shuffle and fletcher32 are unpa
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
@@ -30,6 +33,7 @@ from regil_wrappers.limits import MAX_BYTES, MAX_PIXELS, MAX_TEXT, Budget
 __all__ = [
     "SIGNATURE",
     "array",
+    "created",
     "encoded_pictures",
     "has",
     "json_attribute",
@@ -44,6 +48,28 @@ _DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000
 _FILTERS = (_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF)
 # A chunk is unpacked whole, however small the dataset: this much is allowed to any.
 _FREE_CHUNK = 16 * 1024**2
+
+
+@contextmanager
+def created(path: Path, **options: Any) -> Iterator[h5py.File]:
+    """A new HDF5 file, which reaches the disk when all is in it.
+
+    Until then it is in memory: HDF5 may crash the process when it writes to a full disk.
+
+    Args:
+        path: the file; an existing one is replaced.
+        options: of `h5py.File`.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    memory = io.BytesIO()
+    with h5py.File(memory, "w", **options) as file:
+        yield file
+    with path.open("wb") as stream:
+        stream.write(memory.getbuffer())
+        stream.flush()
+        os.fsync(stream.fileno())
 
 
 @contextmanager

@@ -363,7 +363,7 @@ def write(demo: Demonstration, path: Path) -> None:
     t = len(actions)
     images = _box(demo.frames.shape[1:], "uint8", 0, 255)
     space: dict[str, Any] = images
-    with h5py.File(data / _HDF5, "w", track_order=True) as file:
+    with hdf5.created(data / _HDF5, track_order=True) as file:
         group = file.create_group("episode_0")
         group.attrs["id"] = 0
         group.attrs["total_steps"] = t

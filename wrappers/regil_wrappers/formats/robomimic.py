@@ -157,9 +157,9 @@ def write_robomimic(demo: Demonstration, path: Path) -> None:
         ValueError: without actions.
     """
     assert demo.actions is not None
-    demo.save(path)
     t = len(demo.actions)
-    with h5py.File(path, "r+") as file:
+    with hdf5.created(path) as file:
+        demo._write(file)
         group = file["data/demo_0"]
         if len(demo) > t:
             for key in group["obs"]:
@@ -184,7 +184,7 @@ def write_libero(demo: Demonstration, path: Path) -> None:
         arrays |= {key: value[:t] for key, value in demo.observations.items()}
     elif demo.observations is not None:
         arrays["observation"] = demo.observations[:t]
-    with h5py.File(path, "w") as file:
+    with hdf5.created(path) as file:
         data = file.create_group("data")
         rate = demo.metadata["control_rate"]
         env_args = {
