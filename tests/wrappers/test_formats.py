@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from regil_wrappers import Demonstration, RetrievalRewardWrapper, formats
 from regil_wrappers.formats.changes import FLIPS
 from regil_wrappers.formats.fuzz import example, jpeg, lerobot_film, minari_arrow
@@ -230,6 +231,23 @@ def test_a_telephones_rotation_is_applied(tmp_path: Path) -> None:
     path.write_bytes(content)
     turned = formats.read(path).frames
     np.testing.assert_array_equal(turned, np.rot90(plain, -1, axes=(1, 2)))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_cameras_orientation_is_applied(orientation: int, suffix: str, tmp_path: Path) -> None:
+    upright = np.kron(np.random.default_rng(0).integers(0, 256, (2, 3, 3)), np.ones((16, 16, 1)))
+    upright = upright.astype(np.uint8)
+    # EXIF's definition: where the first row and the first column of what is stored belong
+    stored = {1: upright, 2: upright[:, ::-1], 3: upright[::-1, ::-1], 4: upright[::-1]}
+    stored |= {5: upright.swapaxes(0, 1), 6: np.rot90(upright), 8: np.rot90(upright, -1)}
+    stored[7] = stored[5][::-1, ::-1]
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(stored[orientation]).save(tmp_path / f"0{suffix}", quality=100, exif=exif)
+    (frame,) = formats.read(tmp_path).frames
+    assert frame.shape == upright.shape
+    assert np.abs(frame.astype(int) - upright).mean() < 3
 
 
 def test_pictures_in_the_order_of_their_numbers(tmp_path: Path) -> None:

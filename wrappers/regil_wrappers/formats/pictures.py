@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -50,6 +51,7 @@ _DAMAGED = (
     KeyError,
     TypeError,
     OverflowError,
+    struct.error,
 )
 
 
@@ -63,12 +65,13 @@ def _files(path: Path) -> list[Path]:
 
 
 def decoded(file: BinaryIO | bytes) -> NDArray[np.uint8]:
-    """One PNG or JPEG as (H, W, 3) uint8 RGB; transparency is dropped.
+    """One PNG or JPEG as (H, W, 3) uint8 RGB, upright; transparency is dropped.
 
     Raises:
-        ValueError, OSError, SyntaxError: if it is neither, damaged, or claims too many pixels.
+        ValueError, OSError, SyntaxError, ...: if it is neither, damaged, or claims too many pixels.
     """
     image = need("PIL.Image", "video", "reading pictures")
+    ops = need("PIL.ImageOps", "video", "reading pictures")
     # From memory: Pillow reads as many bytes as a PNG's chunk claims, and a file on disk makes room
     # for all of them first
     stream = io.BytesIO(file if isinstance(file, bytes) else _content(file))
@@ -77,7 +80,9 @@ def decoded(file: BinaryIO | bytes) -> NDArray[np.uint8]:
         check_pixels(*picture.size)
         if picture.mode not in ("RGB", "RGBA", "L", "P", "LA"):
             raise ValueError(f"a picture is of mode {picture.mode}: it must be 8-bit RGB or grey")
-        return np.asarray(picture.convert("RGB"))
+        upright = picture.convert("RGB")
+        ops.exif_transpose(upright, in_place=True)
+        return np.asarray(upright)
 
 
 def _content(file: BinaryIO) -> bytes:
