@@ -215,6 +215,21 @@ def test_a_heap_that_hdf5_would_walk_for_ever(tmp_path: Path) -> None:
         refused(path, "a heap's part does not fit", format=name)
 
 
+def test_lengths_of_a_kind_that_crashes_hdf5(tmp_path: Path) -> None:
+    formats.write(DEMO, tmp_path / "set", "minari")
+    path = tmp_path / "set/data/main_data.hdf5"
+    with h5py.File(path, "r+") as file:
+        del file["episode_0/observations"]
+        lengths = h5py.vlen_dtype(np.uint8)
+        stored = file.create_dataset("episode_0/observations", len(DEMO), lengths)
+        for i, frame in enumerate(DEMO.frames):
+            stored[i] = np.frombuffer(fuzz.jpeg(frame), np.uint8)
+    assert len(formats.read(tmp_path / "set")) == len(DEMO)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"\x19\0\0\0\x10", b"\x19\x09\0\0\x10"))
+    refused(tmp_path / "set", "does not hold pictures")
+
+
 def test_a_picture_that_claims_too_many_pixels(tmp_path: Path) -> None:
     (tmp_path / "shots").mkdir()
     for width, height in ((5000, 5000), (12_000, 12_000), (60_000, 60_000)):

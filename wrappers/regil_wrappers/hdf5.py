@@ -196,9 +196,9 @@ def encoded_pictures(group: h5py.Group, name: str, budget: Budget) -> Iterator[b
     """
     dataset = member(group, name, h5py.Dataset)
     variable = dataset.shape is not None and h5py.check_vlen_dtype(dataset.dtype) == np.uint8
-    if not (variable and dataset.ndim == 1) and not (
-        dataset.dtype == np.uint8 and dataset.ndim == 2
-    ):
+    # The kind of variable length, in HDF5's own encoding: on one that it does not know it crashes
+    known = variable and dataset.id.get_type().encode()[3] == 0
+    if not (known and dataset.ndim == 1) and not (dataset.dtype == np.uint8 and dataset.ndim == 2):
         raise ValueError(f"{dataset.name!r} does not hold pictures")
     _check_storage(dataset)
     for i in range(len(dataset)):
