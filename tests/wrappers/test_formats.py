@@ -255,8 +255,20 @@ def test_pictures_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for i in range(12):
         (tmp_path / f"shots/shot{i}.jpg").write_bytes(jpeg(np.full((8, 8, 3), 20 * i, np.uint8)))
     (tmp_path / "shots/notes.txt").write_text("not a picture")
+    (tmp_path / "shots/._shot0.jpg").write_bytes(b"of a Macintosh")
     means = formats.read(tmp_path / "shots").frames.mean(axis=(1, 2, 3))
     assert (np.diff(means) > 10).all()
+
+
+@pytest.mark.parametrize("name", ["arrow", "parquet", "lerobot"])
+def test_hidden_files_of_a_data_set_are_left_alone(name: str, tmp_path: Path) -> None:
+    if name == "lerobot":
+        formats.write(DEMO, tmp_path / "set", "lerobot")
+    else:
+        minari_arrow(tmp_path / "set", DEMO, name)
+    for file in [f for f in (tmp_path / "set").rglob("*") if f.is_file()]:
+        file.with_name(f"._{file.name}").write_bytes(b"of a Macintosh")
+    assert len(formats.read(tmp_path / "set")) >= len(DEMO) - 1
 
 
 def test_a_film_of_a_person_rewards_but_cannot_guide(demo: Demonstration, tmp_path: Path) -> None:

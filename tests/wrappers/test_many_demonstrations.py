@@ -88,6 +88,7 @@ def test_each_is_recognised(tmp_path: Path) -> None:
 def test_a_folder_guides_and_rewards(tmp_path: Path) -> None:
     for seed in (0, 1):
         record(seed).save(tmp_path / f"{seed}.hdf5")
+    (tmp_path / "._0.hdf5").write_bytes(b"of a Macintosh")
     env = ToyReach()
     guided = RetrievalGuideWrapper(env, str(tmp_path))
     both = RetrievalRewardWrapper(guided, str(tmp_path))

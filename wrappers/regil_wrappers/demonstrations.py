@@ -100,7 +100,8 @@ def as_given(demo: Demonstrations) -> str | Demonstration | list[str | Demonstra
 def demonstrations(
     given: str | Demonstration | list[str | Demonstration],
 ) -> Sequence[Demonstration]:
-    """What `as_given` named, in order; of a folder, the .hdf5 and .h5 files in it by name.
+    """What `as_given` named, in order; of a folder, the .hdf5 and .h5 files in it by name, but
+    for hidden ones (".a.hdf5").
 
     Files are read when they are asked for, each time: only the first is kept.
 
@@ -125,7 +126,8 @@ def _listed(given: str | Demonstration | list[str | Demonstration]) -> list[str 
     if isinstance(given, list):
         return given
     if isinstance(given, str) and Path(given).is_dir():
-        files = sorted(str(f) for f in Path(given).iterdir() if f.suffix in _SUFFIXES)
+        found = (f for f in Path(given).iterdir() if f.suffix in _SUFFIXES)
+        files = sorted(str(f) for f in found if not f.name.startswith("."))
         if not files:
             raise ValueError(f"demo {given!r} is a folder without .hdf5 or .h5 files")
         return list(files)

@@ -352,7 +352,7 @@ def detect(path: str | os.PathLike[str]) -> str:
             return "lerobot"
         if minari.data_folder(path) is not None:
             return "minari"
-        if any(file.suffix.lower() in pictures.suffixes for file in path.iterdir()):
+        if pictures.files(path):
             return "pictures"
     else:
         with path.open("rb") as file:

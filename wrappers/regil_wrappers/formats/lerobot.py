@@ -167,7 +167,7 @@ def _place_v2(path: Path, info: dict[str, Any], episode: int) -> dict[str, Any]:
 
 def _place_v3(path: Path, episode: int) -> dict[str, Any]:
     """The row of ``meta/episodes`` that says where the episode lies."""
-    for file in sorted((path / "meta" / "episodes").glob("*/*.parquet")):
+    for file in sorted((path / "meta" / "episodes").glob("*/[!.]*.parquet")):
         for batch in batches(file, ["episode_index"], Budget(), "lerobot", _says_where):
             columns = [name for name in batch.schema.names if _says_where(name)]
             indices = numbers([batch.column("episode_index")], "episode_index")

@@ -214,7 +214,7 @@ def _read_arrow(
     camera: str | None,
     keys: list[str] | None,
 ) -> dict[str, Any]:
-    files = sorted(folder.glob(f"*.{storage}")) if folder.is_dir() else []
+    files = sorted(folder.glob(f"[!.]*.{storage}")) if folder.is_dir() else []
     if len(files) != 1:
         raise ValueError(f"there is no episode {episode}, or it is not in one {storage} file")
     budget = Budget()

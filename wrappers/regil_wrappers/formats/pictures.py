@@ -21,18 +21,18 @@ from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.formats.changes import Pictures
 from regil_wrappers.limits import MAX_PIXELS, need
 
-__all__ = ["check_pixels", "decoded", "no_bombs", "png", "read", "suffixes", "write"]
+__all__ = ["check_pixels", "decoded", "files", "no_bombs", "png", "read", "suffixes", "write"]
 
 suffixes = (".png", ".jpg", ".jpeg")
 
 
 def read(path: Path, pictures: Pictures) -> dict[str, Any]:
-    """Read every picture of a folder; other files are left alone.
+    """Read every picture of a folder; other files, and hidden ones, are left alone.
 
     Raises:
         ValueError: if there is none, one is damaged, or they differ in size.
     """
-    for file in _files(path):
+    for file in files(path):
         try:
             with file.open("rb") as stream:
                 pictures.add(decoded(stream))
@@ -55,13 +55,15 @@ _DAMAGED = (
 )
 
 
-def _files(path: Path) -> list[Path]:
+def files(path: Path) -> list[Path]:
+    """The pictures of a folder, in order."""
+
     def order(file: Path) -> list[tuple[int, int, str]]:
         parts = re.findall(r"\d+|\D+", file.name.lower())
         return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts]
 
-    found = (f for f in path.iterdir() if f.suffix.lower() in suffixes and f.is_file())
-    return sorted(found, key=order)
+    found = [f for f in path.iterdir() if f.suffix.lower() in suffixes and f.is_file()]
+    return sorted((f for f in found if not f.name.startswith(".")), key=order)
 
 
 def decoded(file: BinaryIO | bytes) -> NDArray[np.uint8]:
