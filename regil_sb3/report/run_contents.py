@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 
 import yaml
 from regil_wrappers import Demonstration
+from regil_wrappers.formats import DAMAGED
 
 from regil_sb3.report.success_films import SuccessFilms, load_films
 
@@ -95,8 +95,9 @@ def read_run(run: Path | str) -> RunContents:
             return None
         try:
             return reader(run / name)
-        except (ValueError, OSError, KeyError, yaml.YAMLError, csv.Error, zipfile.BadZipFile) as e:
-            missing.append(f"{name} cannot be read: {' '.join(str(e).split())}")
+        except (*DAMAGED, yaml.YAMLError, csv.Error) as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            missing.append(f"{name} cannot be read: {reason}")
             return None
 
     return RunContents(

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from regil_wrappers.formats.npz import array_of
+from regil_wrappers.limits import Budget
 
 from regil_sb3.files import replacing
 from regil_sb3.success_buffer import SuccessBuffer
@@ -63,15 +65,17 @@ def load_films(path: Path) -> SuccessFilms:
     """What `save_films` kept.
 
     Raises:
-        ValueError: if it is no such file.
+        ValueError: if it is no such file; and others of `regil_wrappers.formats.DAMAGED`.
     """
     if not zipfile.is_zipfile(path):
         raise ValueError("it is no .npz file")
-    with np.load(path, allow_pickle=False) as arrays:
-        lengths = [int(n) for n in arrays["lengths"]]
-        shown = sorted(int(name.removeprefix("film/")) for name in arrays if name != "lengths")
-        films = [arrays[f"film/{i}"] for i in shown]
-    if any(f.dtype != np.uint8 or f.ndim != 4 or f.shape[3] != 3 for f in films):
+    budget = Budget(path.stat().st_size)
+    with zipfile.ZipFile(path) as archive:
+        lengths = [int(n) for n in array_of(archive, "lengths", budget)]
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
+        shown = sorted(int(name.removeprefix("film/")) for name in names if name != "lengths")
+        films = [array_of(archive, f"film/{i}", budget) for i in shown]
+    if any(f.dtype != np.uint8 or f.ndim != 4 or f.shape[3] != 3 or not f.size for f in films):
         raise ValueError("a film is not uint8 (pictures, H, W, 3)")
     if any(not 0 <= i < len(lengths) for i in shown):
         raise ValueError("it has a film of an episode that is not there")

@@ -12,11 +12,13 @@ import pytest
 import yaml
 from made_run import buffer_of, film
 from regil_wrappers import Demonstration
+from regil_wrappers.formats.fuzz import damaged
 
 from regil_sb3.report import run_page
 from regil_sb3.report.charts import Line, line_chart
 from regil_sb3.report.episode_alignment import align
 from regil_sb3.report.page import flat
+from regil_sb3.report.run_contents import read_run
 from regil_sb3.report.run_page import write_report
 from regil_sb3.report.success_films import load_films, save_films
 from regil_sb3.success_buffer import SuccessBuffer
@@ -217,6 +219,25 @@ def test_a_broken_file_costs_its_part_of_the_page_only(run, name, content):
     text, _ = _page(run)
     assert "Missing from this page" in text
     assert "<h2>Episodes</h2>" in text or name == "evaluation.json"
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "evaluation.json", "calibration.json"])
+def test_a_file_nested_too_deeply_costs_its_part_of_the_page_only(run, name):
+    (run / name).write_text("[" * 100_000)
+    assert f"{name} cannot be read" in _page(run)[0]
+
+
+def test_damaged_films_are_left_out(run):
+    path, rng = run / "success_buffer.npz", np.random.default_rng(0)
+    content = path.read_bytes()
+    others = [f for f in run.iterdir() if f.name not in ("config.yaml", path.name)]
+    for other in others:
+        other.unlink()
+    left_out = 0
+    for _ in range(400):
+        path.write_bytes(damaged(content, rng, content))
+        left_out += read_run(run).kept is None
+    assert left_out > 100
 
 
 def test_a_run_interrupted_while_it_wrote_a_line(run):

@@ -4,6 +4,7 @@
 * ``write`` - a `Demonstration` -> a file or folder
 * ``resample`` - another frame rate
 * ``FORMATS`` - what is known
+* ``DAMAGED`` - what readers raise
 
 A format is a name, or is seen in the file. What each keeps, and its options: ``docs/formats.md``.
 Files are checked before memory is given to them, and nothing in them is executed. Packages that
@@ -40,7 +41,7 @@ from regil_wrappers.formats.changes import (
 )
 from regil_wrappers.limits import Budget
 
-__all__ = ["FORMATS", "Format", "detect", "read", "resample", "write"]
+__all__ = ["DAMAGED", "FORMATS", "Format", "detect", "read", "resample", "write"]
 
 Reader = Callable[..., dict[str, Any]]
 
@@ -119,9 +120,9 @@ FORMATS: dict[str, Format] = {
 }
 """What can be read and written, by name."""
 
-# What readers raise on files that are not what they say. PyAV's and pyarrow's errors derive from
-# ValueError, OSError and others of these; Pillow's from OSError and SyntaxError.
-_DAMAGED = (
+# PyAV's and pyarrow's errors derive from ValueError, OSError and others of these; Pillow's from
+# OSError and SyntaxError.
+DAMAGED = (
     ValueError,
     TypeError,
     KeyError,
@@ -138,6 +139,7 @@ _DAMAGED = (
     zlib.error,
     zipfile.BadZipFile,
 )
+"""What readers raise on files that are not what they say."""
 
 
 def read(
@@ -209,7 +211,7 @@ def read(
         return _finished(fields, taken, path, name, source_fps, fps, actions, held)
     except PermissionError:
         raise
-    except _DAMAGED as error:
+    except DAMAGED as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         start = "" if reason.startswith("demo ") else f"demo {str(path)!r} ({name}): "
         raise ValueError(start + reason) from error

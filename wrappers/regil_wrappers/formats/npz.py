@@ -20,7 +20,7 @@ from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.formats.changes import Pictures
 from regil_wrappers.limits import MAX_TEXT, Budget
 
-__all__ = ["read", "write"]
+__all__ = ["array_of", "read", "write"]
 
 _PREFIX = "observations."
 
@@ -50,7 +50,7 @@ def read(
             )
 
         def array(name: str) -> NDArray[Any] | None:
-            return _array(archive, name, budget) if name in names else None
+            return array_of(archive, name, budget) if name in names else None
 
         frames = array(camera)
         assert frames is not None
@@ -74,8 +74,12 @@ def read(
         }
 
 
-def _array(archive: zipfile.ZipFile, name: str, budget: Budget) -> NDArray[Any]:
-    """One member, once its header claims what the archive says it has, and no objects."""
+def array_of(archive: zipfile.ZipFile, name: str, budget: Budget) -> NDArray[Any]:
+    """One member, once its header claims what the archive says it has, and no objects.
+
+    Raises:
+        ValueError: if it is none, or damaged; and others of `regil_wrappers.formats.DAMAGED`.
+    """
     info = archive.getinfo(f"{name}.npy")
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(
