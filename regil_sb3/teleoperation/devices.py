@@ -308,7 +308,10 @@ class Axes:
         return cls(space.low, space.high, translation, left[:3] if len(left) >= 3 else [], gripper)
 
     def action(self, motion: Floats, closed: bool) -> npt.NDArray[np.float32]:
-        """(A,) float32: the action of a motion (6,) in [-1, 1], the gripper open or closed."""
+        """(A,) float32: the action of a motion (6,) in [-1, 1], the gripper open or closed.
+
+        No motion is 0, or what is nearest to it within the limits; a whole one is a limit.
+        """
         wish = np.zeros(len(self.low))
         moved = motion[:3].copy()
         for _ in range(self.quarters):
@@ -320,5 +323,8 @@ class Axes:
             wish[self.gripper] = 1.0 if closed else -1.0
         bounded = np.isfinite(self.low) & np.isfinite(self.high)
         low, high = np.where(bounded, self.low, -1), np.where(bounded, self.high, 1)
-        action: npt.NDArray[np.float32] = (low + (wish + 1) / 2 * (high - low)).astype(np.float32)
+        rest = np.clip(0, low, high)
+        action: npt.NDArray[np.float32] = (
+            rest + wish * np.where(wish > 0, high - rest, rest - low)
+        ).astype(np.float32)
         return action

@@ -343,7 +343,21 @@ def test_which_dimensions_move():
     assert wipe.action(np.arange(6) / 5, True).tolist() == pytest.approx([0, 0.4, 0.8, 1.2, 1.6, 2])
     assert axes(4, gripper_dim="none").gripper is None
     narrow = Axes.of(gym.spaces.Box(np.float32([0, -1]), np.float32([1, np.inf])), {})
-    assert narrow.action(np.zeros(6), False).tolist() == [0.5, 0]
+    assert narrow.action(np.zeros(6), False).tolist() == [0, 0]
+
+
+def test_nothing_pressed_is_no_motion_where_limits_are_not_symmetric():
+    box = gym.spaces.Box(np.float32([-0.5, -1, 0.25, -2]), np.float32([1, -0.5, 1, 4]))
+    axes = Axes.of(box, {})
+    steps = [axes.action(np.full(6, v), v > 0).tolist() for v in (0, -1, -0.5, 0.5, 1)]
+    assert [step[:3] for step in steps] == [
+        [0, -0.5, 0.25],
+        [-0.5, -1, 0.25],
+        [-0.25, -0.75, 0.25],
+        [0.5, -0.5, 0.625],
+        [1, -0.5, 1],
+    ]
+    assert [step[3] for step in steps] == [-2, -2, -2, 4, 4]  # the gripper has its whole way
 
 
 class Nothing(gym.Env):
