@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import json
 import os
 import shutil
@@ -118,7 +117,12 @@ def locked(run: Path) -> Iterator[None]:
 
     Raises:
         ValueError: another one does.
+        ImportError: on Windows.
     """
+    try:
+        import fcntl
+    except ImportError as error:
+        raise ImportError("a run folder needs Linux or macOS: on Windows, use WSL") from error
     with (run / ".lock").open("a+", encoding="utf-8") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import signal
+import sys
 
 import numpy as np
 import pytest
@@ -336,6 +337,12 @@ def test_dict_observations_from_recording_to_report(tmp_path, monkeypatch):
     assert any(row["eval/success_rate"] for row in rows(run))
     assert {"policy", "guide", "bc"} <= set(json.loads((run / "evaluation.json").read_text()))
     assert not (run / "episode.hdf5").exists()  # pictures are not all that the policy saw
+
+
+def test_where_no_folder_can_be_locked_one_line_says_so(words, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "fcntl", None)  # as on Windows
+    assert main(words) == 2
+    assert "regil: a run folder needs Linux or macOS" in capsys.readouterr().err
 
 
 def test_missing_demonstration_names_what_to_do(tmp_path, monkeypatch, capsys):
