@@ -112,6 +112,8 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "        corner = frames[:, :self.side, :self.side]\n"
         "        return corner.reshape(len(frames), -1).astype(np.float32)\n"
         "number = 3\n"
+        "def three():\n"
+        "    return number\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "my_encoders", raising=False)
@@ -125,6 +127,8 @@ def test_module_and_function_name_the_users_own() -> None:
         ("my_encoders:Corner?length=3", r"no option 'length': choose one of \['side', 'whiten'\]"),
         ("my_encoders:absent", "module 'my_encoders' has no function 'absent'"),
         ("my_encoders:number", "has no function 'number'"),
+        ("my_encoders:three", r"'my_encoders:three': it makes 3, which has no encode\(frames\)"),
+        ("my_encoders:three?whiten=2", "it makes 3"),
     ):
         with pytest.raises(ValueError, match=match):
             make_encoder(name)

@@ -181,12 +181,14 @@ def test_dinov3_takes_any_multiple_of_its_patch(folder: Path) -> None:
 def test_what_is_not_timms_is_refused_in_one_line(tmp_path: Path) -> None:
     file = tmp_path / "other.pth"
     torch.save(weights_of(network(VIT)), file)
+    torch.save([torch.zeros(1)], tmp_path / "list.pth")
     for name, match in (
         (f"timm:{RESNET}@{file}", "could not be read from"),
         (f"timm:{RESNET}@absent.pth", "there is no checkpoint file 'absent.pth'"),
         ("timm:test_resnett", "no model of that name: did you mean"),
         ("timm:test_resnet.mine", r"Invalid pretrained tag \(mine\)"),
         (f"efficientnet-lite0@{file}", r"could not be read from .* tensors and the network"),
+        (f"efficientnet-lite0@{tmp_path / 'list.pth'}", "it holds a list, not tensors by name"),
         (f"r3m-resnet18@{file}", "it has no entry 'r3m'"),
         (f"torchscript:{file}", "could not be read from"),
         ("torchscript:absent.pt", "there is no file 'absent.pt'"),

@@ -138,7 +138,8 @@ def make_encoder(name: str, **options: Hashable) -> Encoder:
             it: its factory's keywords.
 
     Raises:
-        ValueError: if there is no encoder of that name, or it has no such option.
+        ValueError: if there is no encoder of that name, it has no such option, or what is made by
+            that name is none.
         MissingWeightsError: a ValueError, if its weights cannot be had.
         ImportError: if it needs a package that is not installed.
     """
@@ -151,7 +152,10 @@ def make_encoder(name: str, **options: Hashable) -> Encoder:
         factory = _factory(base, file)
         _check_options(factory, given)
         if whiten is None:
-            return factory(**given)
+            made = factory(**given)
+            if not callable(getattr(made, "encode", None)):
+                raise ValueError(f"it makes {made!r:.50}, which has no encode(frames)")
+            return made
     except (ImportError, ValueError) as error:
         kinds = (ImportError, MissingWeightsError, ValueError)
         kind = next(kind for kind in kinds if isinstance(error, kind))

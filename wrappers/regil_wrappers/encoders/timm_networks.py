@@ -169,7 +169,11 @@ def efficientnet_lite0(
             )
         path = Path(package.origin).with_name("models") / "efficientnet-lite0-57934424.pth"
     network = timm.create_model("tf_efficientnet_lite0", pretrained=False)
-    _fill(network, path, list(read_weights(path).values()))
+    weights = read_weights(path)
+    if not isinstance(weights, dict):
+        held = type(weights).__name__
+        raise ValueError(unreadable(path, ValueError(f"it holds a {held}, not tensors by name")))
+    _fill(network, path, list(weights.values()))
     return _elsewhere("efficientnet-lite0", network, features, preprocessing, execution)
 
 
