@@ -54,7 +54,7 @@ def guide_view(
     are in it.
 
     Args:
-        demo: with actions.
+        demo: with actions; where it states no limits of them, 1, or the largest, is taken.
         first: (H, W, 3) uint8.
         calibration: what `RetrievalGuideWrapper.calibration` gave.
 
@@ -63,7 +63,12 @@ def guide_view(
     """
     if demo.actions is None:
         raise ValueError("the demonstration has no actions")
-    low, high = (np.array(demo.metadata[f"action_{x}"], np.float32) for x in ("low", "high"))
+    most = np.maximum(np.abs(demo.actions).max(axis=0), 1)
+    said = (demo.metadata[f"action_{x}"] for x in ("low", "high"))
+    low, high = (
+        np.array(limit if x is None else x, np.float32)
+        for x, limit in zip(said, (-most, most), strict=True)
+    )
     dims, plane = calibration.get("translation_dims"), calibration.get("plane")
     if dims is None or plane is None:
         raise ValueError("the calibration says neither translation_dims nor plane")

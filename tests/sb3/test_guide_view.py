@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import toy_camera
 from regil_wrappers import RetrievalGuideWrapper
 
+from regil_sb3.report import run_page
 from regil_sb3.report.guide_view import guide_picture, guide_view
 from regil_sb3.report.run_page import write_report
 
@@ -82,7 +84,16 @@ def test_where_it_would_not_correct_there_is_no_picture(calibrated):
         guide_view(demo, first, {"ways": []})
 
 
-def test_the_report_shows_it(calibrated, tmp_path):
+def test_a_demonstration_that_states_no_limits(calibrated):
+    demo, calibration = calibrated
+    limits = {"action_low": None, "action_high": None}
+    bare = dataclasses.replace(demo, metadata={**demo.metadata, **limits})
+    first, _ = toy_camera.ToyCamera().reset(seed=1)
+    seen, stated = (guide_view(one, first, calibration) for one in (bare, demo))
+    np.testing.assert_array_equal(seen.corrected, stated.corrected)
+
+
+def test_the_report_shows_it(calibrated, tmp_path, monkeypatch):
     demo, calibration = calibrated
     demo.save(tmp_path / "demo.hdf5")
     other = toy_camera.ToyCamera()
@@ -95,3 +106,8 @@ def test_the_report_shows_it(calibrated, tmp_path):
     assert "What the guide sees" in write_report(tmp_path).read_text()
     (tmp_path / "calibration.json").write_text("{}")
     assert "calibration.json cannot be used" in write_report(tmp_path).read_text()
+    for part in ("align", "guide_view"):  # whatever goes wrong in one
+        monkeypatch.setattr(run_page, part, lambda *_: np.zeros(1)[2])
+    page = write_report(tmp_path).read_text()
+    assert "alignment: index 2 is out of bounds" in page
+    assert "calibration.json cannot be used: index 2 is out of bounds" in page
