@@ -10,9 +10,14 @@ import torch as th
 
 
 def set_threads() -> None:
-    """Let OMP_NUM_THREADS decide, where it is set, over torch's own choice."""
-    if os.environ.get("OMP_NUM_THREADS"):
-        th.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+    """Let OMP_NUM_THREADS decide, where it is set, over torch's own choice.
+
+    Of a list, "4,2", the first counts: those after it are of nested regions. What is no number of
+    threads is left to OpenMP, which warns of it.
+    """
+    first = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
+    if first.isdecimal() and int(first):
+        th.set_num_threads(int(first))
 
 
 def keep_freed_memory() -> None:
