@@ -19,6 +19,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from regil_wrappers import Demonstration
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -397,6 +398,7 @@ def evaluate_run(
         if not offline and "bc" in only:
             acts.append(("bc", policy_act(_bc_model(settings, demo, env, run, trust)), env))
         acts = [act for act in acts if act[0] in only]
+        filmed: Evaluation | None = None
         for name, act, where in acts:
             with tqdm(total=episodes, desc=f"evaluating {name}", dynamic_ncols=True) as bar:
 
@@ -407,12 +409,31 @@ def evaluate_run(
                 result = evaluate(act, where, episodes, EVALUATION_SEED, show)
             results[name] = result.as_dict()
             if name == "policy":
-                policy_result = result
+                filmed = result
         results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
         results["asked"] = [name for name in METHODS if name in only]
     with replacing(run / "evaluation.json") as file:
         file.write(json.dumps(results, indent=1).encode())
-    episode = policy_result.first_episode({**demo.metadata, "seed": EVALUATION_SEED})
-    if episode is not None:
-        episode.save(run / "episode.hdf5")
+    if filmed is not None:
+        _save_film(filmed, demo, env.action_space, run / "episode.hdf5")
     return results
+
+
+def _save_film(
+    result: Evaluation, demo: Demonstration, space: spaces.Space[Any], path: Path
+) -> None:
+    """Keep an evaluation's first episode as a demonstration; what is none costs the film alone."""
+    assert isinstance(space, spaces.Box)
+    bounded = bool(np.isfinite([space.low, space.high]).all())
+    own = {
+        "action_low": space.low.tolist() if bounded else None,
+        "action_high": space.high.tolist() if bounded else None,
+        "image_size": None,  # what the policy sees may be of another than what is compared
+        "seed": EVALUATION_SEED,
+    }
+    try:
+        episode = result.first_episode({**demo.metadata, **own})
+        if episode is not None:
+            episode.save(path)
+    except (ValueError, OSError) as error:
+        print(f"{path.name} is not saved: {error}", file=sys.stderr)

@@ -1,0 +1,89 @@
+"""Evaluating a run that has learned: what comes of it whatever the folder and the film are like."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import toy_env
+import yaml
+from regil_wrappers import Demonstration
+
+from regil_sb3.training import evaluate_run
+
+
+@pytest.fixture
+def run(toy_run, tmp_path):
+    """A copy that has not been evaluated."""
+    shutil.copytree(toy_run, tmp_path / "run")
+    for name in ("evaluation.json", "episode.hdf5"):
+        (tmp_path / "run" / name).unlink()
+    return tmp_path / "run"
+
+
+def other_demo(run, **changes):
+    """Put another demonstration into a run."""
+    demo = Demonstration.load(run / "demo.hdf5")
+    metadata = {**demo.metadata, **changes.pop("metadata", {})}
+    dataclasses.replace(demo, metadata=metadata, **changes).save(run / "demo.hdf5")
+
+
+def config(run, change):
+    """Change what a run's config.yaml says."""
+    said = yaml.safe_load((run / "config.yaml").read_text())
+    change(said)
+    (run / "config.yaml").write_text(yaml.safe_dump(said))
+
+
+def test_without_the_policy_there_is_no_film(run):
+    found = evaluate_run(run, 1, only=("guide",))
+    assert found["guide"]["successes"] == [True]
+    assert json.loads((run / "evaluation.json").read_text()) == found
+    assert not (run / "episode.hdf5").exists()
+
+
+def test_the_film_has_the_environments_limits(run):
+    """The demonstration's own may be narrower than what a policy does."""
+    actions = Demonstration.load(run / "demo.hdf5").actions * np.float32(0.001)
+    limits = {"action_low": [-0.001] * 2, "action_high": [0.001] * 2}
+    other_demo(run, actions=actions, metadata=limits)
+    evaluate_run(run, 1, only=("policy",))
+    episode = Demonstration.load(run / "episode.hdf5")
+    assert np.abs(episode.actions).max() > 0.001
+    assert episode.metadata["action_high"] == [1, 1]
+
+
+class Rendered(toy_env.ToyReach):
+    """Rendered larger than it is observed."""
+
+    def render(self):
+        return self.encoder_frame(64)
+
+
+def test_the_film_has_the_size_that_the_policy_sees(run):
+    gym.register("ToyRendered-v0", entry_point=Rendered)
+    frames = Demonstration.load(run / "demo.hdf5").frames
+    larger = np.array([np.kron(f, np.ones((4, 4, 1), np.uint8))[::3, ::3] for f in frames])
+    assert larger.shape[1:] == (64, 64, 3)
+    other_demo(run, frames=larger, metadata={"image_size": None})
+
+    def rendered(said):
+        said["env"] = "ToyRendered-v0"
+        for wrapper in said["env_wrapper"]:
+            next(iter(wrapper.values()))["image"] = "render"
+
+    config(run, rendered)
+    evaluate_run(run, 1, only=("policy",))
+    gym.registry.pop("ToyRendered-v0")
+    assert Demonstration.load(run / "episode.hdf5").metadata["image_size"] == [48, 48]
+
+
+def test_a_film_that_does_not_fit_costs_the_film_alone(run, capsys):
+    (run / "episode.hdf5").mkdir()
+    found = evaluate_run(run, 1, only=("policy",))
+    assert json.loads((run / "evaluation.json").read_text()) == found
+    assert "episode.hdf5 is not saved: " in capsys.readouterr().err
