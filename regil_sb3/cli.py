@@ -393,8 +393,11 @@ def _evaluate(run: Path, episodes: int, trust: bool = False) -> None:
     process.keep_freed_memory()
     if episodes < 1:
         raise ValueError(f"--episodes is {episodes}: at least 1 is needed")
+    unsaved = None
     try:
         results = training.evaluate_run(run, episodes, trust)
+    except training.UnsavedError as error:
+        results, unsaved = error.results, error
     except KeyboardInterrupt:
         print(f"\nnot evaluated; later: regil evaluate {run}", file=sys.stderr)
         raise
@@ -402,6 +405,8 @@ def _evaluate(run: Path, episodes: int, trust: bool = False) -> None:
     for name, title in METHODS.items():
         if name in results:
             print(f"  {title:<15} {results[name]['success']:.2f}")
+    if unsaved is not None:
+        raise unsaved
     write_card(run)
 
 

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import shutil
+import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +31,23 @@ def refuse_finished(run: Path) -> None:
         raise ValueError(
             f"{run} holds a run already: choose another --out, or go on with --resume {run}"
         )
+
+
+def refuse_unwritable(run: Path) -> None:
+    """Find out before long work that its outcome could not be kept.
+
+    Raises:
+        ValueError: nothing can be written in the folder.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=run) as file:
+            file.write(bytes(1 << 16))
+            file.flush()
+    except OSError as error:
+        raise ValueError(
+            f"nothing can be written in {run} ({error.strerror}): make room, or use a copy of it "
+            "that is your own"
+        ) from error
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:

@@ -51,6 +51,7 @@ from regil_sb3.run_folder import (
     locked,
     refuse_finished,
     refuse_removed,
+    refuse_unwritable,
     save_calibration,
     save_model,
     steps_learned,
@@ -345,8 +346,23 @@ def _bc_model(settings: Settings, demo: Demonstration, env: VecEnv, run: Path, t
     if (run / "bc_model.zip").exists():
         return BC.load(run / "bc_model.zip", trust=trust, buffer_size=1)
     bc = train_bc(settings, demo, env, BC_UPDATES)
-    save_model(bc, run / "bc_model.zip")
+    try:
+        save_model(bc, run / "bc_model.zip")
+    except OSError as error:  # the next evaluation trains it again
+        print(f"bc_model.zip is not saved: {error}", file=sys.stderr)
     return bc
+
+
+class UnsavedError(OSError):
+    """An evaluation is done, and ``evaluation.json`` could not be written.
+
+    Attributes:
+        results: what would be in it.
+    """
+
+    def __init__(self, why: str, results: dict[str, Any]) -> None:
+        super().__init__(why)
+        self.results = results
 
 
 def evaluate_run(
@@ -368,11 +384,13 @@ def evaluate_run(
         is not corrected.
 
     Raises:
-        ValueError: no run folder, or one without a model.
+        ValueError: no run folder, one without a model, or one in which nothing can be written.
+        UnsavedError: what was found, which could not be written.
     """
     settings = Settings.load(run / "config.yaml")
     if not (run / "model.zip").exists():
         raise ValueError(f"{run} has no model.zip yet: train it first")
+    refuse_unwritable(run)
     demo = Demonstration.load(run / "demo.hdf5")
     with (
         closing(make_env(settings, run / "demo.hdf5", n_envs=1)) as env,
@@ -412,8 +430,11 @@ def evaluate_run(
                 filmed = result
         results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
         results["asked"] = [name for name in METHODS if name in only]
-    with replacing(run / "evaluation.json") as file:
-        file.write(json.dumps(results, indent=1).encode())
+    try:
+        with replacing(run / "evaluation.json") as file:
+            file.write(json.dumps(results, indent=1).encode())
+    except OSError as error:
+        raise UnsavedError(f"{run}/evaluation.json is not saved: {error}", results) from error
     if filmed is not None:
         _save_film(filmed, demo, env.action_space, run / "episode.hdf5")
     return results

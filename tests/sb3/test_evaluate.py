@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import shutil
 
@@ -13,6 +14,8 @@ import toy_env
 import yaml
 from regil_wrappers import Demonstration
 
+from regil_sb3 import run_folder, training
+from regil_sb3.cli import main
 from regil_sb3.training import evaluate_run
 
 
@@ -87,3 +90,29 @@ def test_a_film_that_does_not_fit_costs_the_film_alone(run, capsys):
     found = evaluate_run(run, 1, only=("policy",))
     assert json.loads((run / "evaluation.json").read_text()) == found
     assert "episode.hdf5 is not saved: " in capsys.readouterr().err
+
+
+def full(*_, **__):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_folder_in_which_nothing_can_be_written_is_said_first(run, monkeypatch, capsys):
+    monkeypatch.setattr(run_folder.tempfile, "TemporaryFile", full)
+    monkeypatch.setattr(training, "evaluate", None)
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"nothing can be written in {run} (No space left on device)" in line
+
+
+def test_a_disk_that_is_full_at_the_end_costs_the_files_alone(run, monkeypatch, capsys):
+    """Methods are evaluated, and printed, whichever of their files cannot be written."""
+    (run / "bc_model.zip").unlink()
+    monkeypatch.setattr(training, "BC_UPDATES", 3)
+    monkeypatch.setattr(training, "replacing", full)
+    monkeypatch.setattr(run_folder, "replacing", full)
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 2
+    said = capsys.readouterr()
+    assert "BC on the demo" in said.out
+    assert "bc_model.zip is not saved: " in said.err
+    assert said.err.splitlines()[-1].startswith(f"regil: {run}/evaluation.json is not saved: ")
+    assert not (run / "evaluation.json").exists()
