@@ -132,7 +132,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--trust",
         action="store_true",
-        help="the models may name anything, and so run code: your own policies and encoders",
+        help="config and models may name anything, and so run code: your own policies and encoders",
     )
 
     report = commands.add_parser(
@@ -381,7 +381,7 @@ def _train(args: argparse.Namespace) -> None:
         elif (run / "model.zip").exists():
             print(f"\nthe model is in {run}: regil evaluate {run}", file=sys.stderr)
         raise
-    _evaluate(run, args.episodes)
+    _evaluate(run, args.episodes, trust=True)  # it was made here
     _report([run], None)
 
 

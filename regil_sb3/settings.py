@@ -13,6 +13,7 @@ from typing import Any
 
 import yaml
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper, make_encoder
+from regil_wrappers.encoders import runs_code
 
 from regil_sb3.baselines import BAKU, BC, ROT, ReverseForwardCurriculum
 from regil_sb3.files import replacing
@@ -94,20 +95,37 @@ class Settings:
             file.write(text.encode())
 
     @classmethod
-    def load(cls, path: Path) -> Settings:
+    def load(cls, path: Path, trust: bool = False) -> Settings:
         """Read what ``save`` wrote.
 
+        Args:
+            path: of ``config.yaml``.
+            trust: whether an encoder may be code that the file names, as in runs of one's own.
+
         Raises:
-            ValueError: the file is missing or not such a file.
+            ValueError: the file is missing or not such a file, or its encoder is code.
         """
         try:
             read = yaml.safe_load(path.read_text(encoding="utf-8"))
             read = {"algo": "td3bc", "eval_freq": None, **read}  # which older runs do not say
-            return cls(**{name: read[name] for name in cls.__dataclass_fields__})
+            settings = cls(**{name: read[name] for name in cls.__dataclass_fields__})
+            code = [] if trust else [n for n in settings._encoders() if runs_code(n)]
         except _UNREADABLE as error:
             raise ValueError(
                 f"{path.parent} is not a run folder of `regil train` ({path.name}: {error!r})"
             ) from error
+        if code:
+            raise ValueError(
+                f"{path} names code to run, encoder {code[0]!r}: if you trust whoever made the "
+                "run, trust=True (--trust)"
+            )
+        return settings
+
+    def _encoders(self) -> list[str]:
+        """What the wrappers' arguments name, whatever the wrappers are called."""
+        entries = [entry for entry in self.env_wrapper if isinstance(entry, dict)]
+        given = [arguments or {} for entry in entries for arguments in entry.values()]
+        return [str(arguments["encoder"]) for arguments in given if "encoder" in arguments]
 
     @property
     def warmup_steps(self) -> int:

@@ -243,12 +243,13 @@ def resume(run: Path) -> Settings:
     """Go on with a run that was interrupted, wherever it was, as if it had not been.
 
     One that learns from the demonstration alone has no checkpoints: it goes on from the model that
-    Ctrl-C or an evaluation saved last, or begins anew.
+    Ctrl-C or an evaluation saved last, or begins anew. A run is one's own: an encoder that its
+    config names as code is run.
 
     Raises:
         ValueError: no run, or one that has ended already.
     """
-    settings = Settings.load(run / "config.yaml")
+    settings = Settings.load(run / "config.yaml", trust=True)
     demo = Demonstration.load(run / "demo.hdf5")
     offline = issubclass(ALGOS[settings.algo], Offline)
     with locked(run):
@@ -376,7 +377,8 @@ def evaluate_run(
     Args:
         run: the folder.
         episodes: unseen episodes, the same for each method.
-        trust: whether the models may name anything, and so run code (``TD3BC.load``).
+        trust: whether config and models may name anything, and so run code (``Settings.load``,
+            ``TD3BC.load``).
         only: which of `METHODS`; BC, which has to be trained, is not where it is not asked for.
 
     Returns:
@@ -384,10 +386,11 @@ def evaluate_run(
         is not corrected.
 
     Raises:
-        ValueError: no run folder, one without a model, or one in which nothing can be written.
+        ValueError: no run folder, one without a model, or one in which nothing can be written; or
+            its config names code, and is not trusted.
         UnsavedError: what was found, which could not be written.
     """
-    settings = Settings.load(run / "config.yaml")
+    settings = Settings.load(run / "config.yaml", trust)
     if not (run / "model.zip").exists():
         raise ValueError(f"{run} has no model.zip yet: train it first")
     refuse_unwritable(run)

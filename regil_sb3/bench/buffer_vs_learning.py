@@ -108,7 +108,7 @@ def learned(folders: Sequence[Path | str]) -> tuple[list[Learned], list[str]]:
     found, left_out = [], []
     for folder in folders:
         run = read_run(folder)
-        settings = Settings.load(run.folder / "config.yaml")
+        settings = Settings.load(run.folder / "config.yaml", trust=True)  # nothing of it is run
         outcomes = successes(run.evaluation.get("policy"))
         buffer = buffer_after_warmup(run, settings.warmup_steps)
         if not settings.warmup_steps:

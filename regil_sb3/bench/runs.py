@@ -208,7 +208,7 @@ def others(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         if not (config := run.folder / "config.yaml").exists():
             continue
-        then, now = asdict(Settings.load(config)), asdict(run.settings_now)
+        then, now = asdict(Settings.load(config, trust=True)), asdict(run.settings_now)
         if differ := [name for name in now if then[name] != now[name]]:
             lines.append(
                 f"{run.folder} was made with other settings ({', '.join(differ)}): "
@@ -316,14 +316,14 @@ def _train(run: Run) -> None:
     process.keep_freed_memory()
     process.set_threads()
     if (config := run.folder / "config.yaml").exists():
-        if not training.has_learned(run.folder, Settings.load(config)):
+        if not training.has_learned(run.folder, Settings.load(config, trust=True)):
             training.resume(run.folder)
     else:
         training.train(run.settings_now, Demonstration.load(run.demo), run.folder)
     only = ("policy", "best_policy", *dict(run.beside).values())
     with locked(run.folder):
         if not run.finished:
-            training.evaluate_run(run.folder, run.episodes, only=only)
+            training.evaluate_run(run.folder, run.episodes, trust=True, only=only)
 
 
 def finish_all(

@@ -16,7 +16,8 @@ from regil_wrappers import Demonstration
 
 from regil_sb3 import run_folder, training
 from regil_sb3.cli import main
-from regil_sb3.training import evaluate_run
+from regil_sb3.settings import Settings
+from regil_sb3.training import evaluate_run, make_env
 
 
 @pytest.fixture
@@ -116,3 +117,39 @@ def test_a_disk_that_is_full_at_the_end_costs_the_files_alone(run, monkeypatch, 
     assert "bc_model.zip is not saved: " in said.err
     assert said.err.splitlines()[-1].startswith(f"regil: {run}/evaluation.json is not saved: ")
     assert not (run / "evaluation.json").exists()
+
+
+def with_encoder(run, encoder, wrapper="regil_wrappers.RetrievalRewardWrapper"):
+    """Let the config name an encoder, in a wrapper more."""
+    config(run, lambda said: said["env_wrapper"].append({wrapper: {"encoder": encoder}}))
+
+
+@pytest.mark.parametrize("wrapper", ["RetrievalRewardWrapper", "wrappers.RetrievalGuideWrapper"])
+@pytest.mark.parametrize("encoder", ["subprocess:call?args=touch,{}", "torchscript:{}"])
+def test_code_that_a_config_names_is_not_run(encoder, wrapper, run, tmp_path, capsys):
+    encoder = encoder.format(tmp_path / "executed")
+    with_encoder(run, encoder, f"regil_wrappers.{wrapper}")
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert encoder in line
+    assert "--trust" in line
+    with pytest.raises(ValueError, match=r"trust=True \(--trust\)"):
+        make_env(Settings.load(run / "config.yaml"), run / "demo.hdf5", n_envs=1)  # as the card has
+    assert not (tmp_path / "executed").exists()
+
+
+def test_encoders_of_ones_own_are_run(words, monkeypatch, tmp_path):
+    monkeypatch.setattr(training, "BC_UPDATES", 3)
+    run, named = tmp_path / "run", "toy_encoder:grey"
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "toy_encoder.py").write_text(
+        "class Grey:\n    def encode(self, frames):\n"
+        "        return frames.mean((2, 3), dtype='float32')\n\n\n"
+        "def grey():\n    return Grey()\n"
+    )
+    assert main([*words, "--set", f"encoder={named}"]) == 0
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 2
+    assert main(["evaluate", str(run), "--episodes", "1", "--trust"]) == 0
+    for name in ("model.zip", "progress.csv"):  # as if it had been killed early
+        (run / name).unlink()
+    assert main(["train", "--resume", str(run), "--episodes", "1"]) == 0
