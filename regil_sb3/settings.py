@@ -8,6 +8,7 @@ import inspect
 from dataclasses import asdict, dataclass, field
 from importlib import import_module, resources
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -100,32 +101,38 @@ class Settings:
 
         Args:
             path: of ``config.yaml``.
-            trust: whether an encoder may be code that the file names, as in runs of one's own.
+            trust: whether it may name code to run, as one's own may: an encoder, or an environment
+                that would be imported out of its folder.
 
         Raises:
-            ValueError: the file is missing or not such a file, or its encoder is code.
+            ValueError: the file is missing or not such a file, or it names code.
         """
         try:
             read = yaml.safe_load(path.read_text(encoding="utf-8"))
             read = {"algo": "td3bc", "eval_freq": None, **read}  # which older runs do not say
             settings = cls(**{name: read[name] for name in cls.__dataclass_fields__})
-            code = [] if trust else [n for n in settings._encoders() if runs_code(n)]
+            code = [] if trust else settings._code(path.parent)
         except _UNREADABLE as error:
             raise ValueError(
                 f"{path.parent} is not a run folder of `regil train` ({path.name}: {error!r})"
             ) from error
         if code:
             raise ValueError(
-                f"{path} names code to run, encoder {code[0]!r}: if you trust whoever made the "
-                "run, trust=True (--trust)"
+                f"{path} names code to run, {code[0]}: if you trust whoever made the run, "
+                "trust=True (--trust)"
             )
         return settings
 
-    def _encoders(self) -> list[str]:
-        """What the wrappers' arguments name, whatever the wrappers are called."""
+    def _code(self, run: Path) -> list[str]:
+        """What of the config of a run's folder names a program, in whichever wrapper."""
         entries = [entry for entry in self.env_wrapper if isinstance(entry, dict)]
         given = [arguments or {} for entry in entries for arguments in entry.values()]
-        return [str(arguments["encoder"]) for arguments in given if "encoder" in arguments]
+        encoders = [str(arguments["encoder"]) for arguments in given if "encoder" in arguments]
+        code = [f"encoder {name!r}" for name in encoders if runs_code(name)]
+        module, separator, _ = self.env.partition(":")
+        if separator and _is_in(module, run):
+            code.append(f"environment {self.env!r}")
+        return code
 
     @property
     def warmup_steps(self) -> int:
@@ -295,6 +302,19 @@ def _value(text: str) -> Any:
             return value
         return int(number) if number.is_integer() and "." not in value else number
     return value
+
+
+def _is_in(module: str, run: Path) -> bool:
+    """Whether Python would import a module, or the package that has it, out of a run's folder."""
+    try:
+        spec = find_spec(module.partition(".")[0])
+    except ValueError:  # no name of a module
+        return False
+    if spec is None:
+        return False
+    run = run.resolve()
+    places = [Path(p).resolve() for p in spec.submodule_search_locations or [spec.origin or "."]]
+    return any(run in (p, *p.parents) or p in run.parents for p in places)
 
 
 def encoder_size(settings: Settings) -> int | None:

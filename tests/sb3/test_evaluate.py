@@ -138,6 +138,18 @@ def test_code_that_a_config_names_is_not_run(encoder, wrapper, run, tmp_path, ca
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.parametrize("module", ["run.evil", "evil"])
+def test_a_downloaded_environment_is_not_imported(module, run, tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(run if module == "evil" else tmp_path)
+    (run / "evil.py").write_text("raise SystemExit('executed')\n")
+    config(run, lambda said: said.update(env=f"{module}:ToyReach-v0"))
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 2
+    assert f"names code to run, environment '{module}:T" in capsys.readouterr().err
+    for own in ("toy_env:ToyReach-v0", "nowhere:ToyReach-v0", ":ToyReach-v0"):
+        config(run, lambda said, own=own: said.update(env=own))
+        assert Settings.load(run / "config.yaml").env == own
+
+
 def test_encoders_of_ones_own_are_run(words, monkeypatch, tmp_path):
     monkeypatch.setattr(training, "BC_UPDATES", 3)
     run, named = tmp_path / "run", "toy_encoder:grey"
