@@ -275,7 +275,8 @@ def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> N
         checkpoints = CheckpointCallback(checkpoints_of(run), log=log)
         checkpoints.restore(model)
     done = model.num_timesteps
-    if not done:
+    anew = not done and not (checkpoints is not None and checkpoints.restored)
+    if anew:
         if checkpoints is not None and log.exists() and log.stat().st_size:
             warnings.warn(
                 f"{run} has no checkpoint to go on from: it begins anew at step 0", stacklevel=3
@@ -293,7 +294,7 @@ def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> N
     callbacks: list[BaseCallback] = [watch, callback]
     callbacks += [] if checkpoints is None else [checkpoints]
     try:
-        model.learn(settings.steps - done, callbacks, reset_num_timesteps=done == 0)
+        model.learn(settings.steps - done, callbacks, reset_num_timesteps=anew)
         save_model(model, run / "model.zip")
         forget_checkpoints(run)
     except KeyboardInterrupt:

@@ -166,8 +166,9 @@ def live(
     model = new_model(env, **changes)
     checkpoints = CheckpointCallback(folder, steps=every)
     done = checkpoints.restore(model)
+    anew = not checkpoints.restored
     try:
-        model.learn(STEPS - done, [checkpoints, *also(done)], reset_num_timesteps=done == 0)
+        model.learn(STEPS - done, [checkpoints, *also(done)], reset_num_timesteps=anew)
         return learner_state(model)
     finally:
         checkpoints.close()

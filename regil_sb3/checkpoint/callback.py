@@ -64,7 +64,8 @@ class CheckpointCallback(BaseCallback):
         ...     model = TD3BC("MlpPolicy", env, bc_coef=0, warmup_steps=0, buffer_size=100)
         ...     checkpoints = CheckpointCallback(folder, steps=20)
         ...     done = checkpoints.restore(model)  # 0 where there is no checkpoint yet
-        ...     model.learn(steps - done, checkpoints, reset_num_timesteps=done == 0)
+        ...     anew = not checkpoints.restored
+        ...     model.learn(steps - done, checkpoints, reset_num_timesteps=anew)
         ...     return done
         >>> env = ReplayableEpisode(gym.make("Pendulum-v1"))
         >>> life(folder, env, 50), life(folder, env, 70)
@@ -79,6 +80,10 @@ class CheckpointCallback(BaseCallback):
         max_bytes: what all may take on disk; the oldest go first, the newest never. None: anything.
         grace: seconds from SIGTERM or Ctrl-C to the end of the process.
         log: a text file that goes back to what it held then: a logger's.
+
+    Attributes:
+        restored: whether `restore` found a checkpoint; the first one is of step 0, and ``learn``
+            must not begin anew after it, either.
 
     Raises:
         ValueError: an argument is out of range; from `restore` and ``learn``, if the model does not
@@ -102,6 +107,7 @@ class CheckpointCallback(BaseCallback):
             )
         self.generations = Generations(Path(folder), keep, max_bytes)
         self.seconds, self.steps, self.grace, self.log = seconds, steps, grace, log
+        self.restored = False
         self._process = os.getpid()
         self._told: int | None = None  # the signal that came
         self._saving = False
@@ -119,13 +125,15 @@ class CheckpointCallback(BaseCallback):
         """Bring a new model to where the newest checkpoint left one like it.
 
         Returns:
-            the steps it has learned for; 0 where there is no checkpoint.
+            the steps it has learned for; 0 where there is no checkpoint (``restored`` says so), or
+            it is of the beginning.
 
         Raises:
             ValueError: the checkpoint is of another model or of other environments.
             MemoryError: it would not fit into memory.
         """
         state = self.generations.load()
+        self.restored = state is not None
         if state is None:
             return 0
         check_can_be_kept(model)

@@ -254,7 +254,7 @@ def _environments_state(env: VecEnv) -> dict[str, Any]:
 
 
 def _load_environments_state(env: VecEnv, state: dict[str, Any]) -> list[str]:
-    env._reset_seeds()  # those of a new run
+    env.unwrapped._reset_seeds()  # those of a new run, which the next reset would take
     outside = _retrieves_outside(env)
     if state["open"] is not None and env.has_attr("go_back") and not outside:
         for stack, kept in zip(_stacks(env), state["stacks"], strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import multiprocessing
 import os
@@ -91,17 +92,34 @@ def test_killed_again_and_again_ends_the_same(of_env, changes, tmp_path):
     assert_same(ended, never_killed)
 
 
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_killed_before_its_second_checkpoint_ends_the_same(n_envs, tmp_path):
+    """The first is of step 0, where environments have been reset already."""
+    never_killed = live(tmp_path / "whole", toy(n_envs), every=90)
+    assert live(tmp_path / "chain", toy(n_envs), 40, every=90) is None
+    again = CheckpointCallback(tmp_path / "chain")
+    assert not again.restored
+    assert again.restore(new_model(toy(n_envs))) == 0
+    assert again.restored
+    assert_same(live(tmp_path / "chain", toy(n_envs), every=90), never_killed)
+
+
 def test_open_episodes_that_cannot_be_replayed_are_truncated(tmp_path):
     assert live(tmp_path, toy(replayable=False), 100, every=25) is None
     model = new_model(toy(replayable=False))
     checkpoints = CheckpointCallback(tmp_path, steps=25)
     with pytest.warns(UserWarning, match="ended as truncated: its environment is no Replayable"):
         done = checkpoints.restore(model)
+    (generator,) = model.env.get_attr("np_random")
+    goes_on = copy.deepcopy(generator).uniform(0, 12)
     buffer = model.replay_buffer
     assert done == buffer.total == 75
     was_open = buffer.dones[done - 1] == 0
     assert was_open.all()
-    model.learn(STEPS - done, checkpoints, reset_num_timesteps=False)
+    model.learn(1, reset_num_timesteps=False)
+    x = model.env.get_attr("x")[0] - 4 * buffer.actions[done, 0, 0]
+    assert x == pytest.approx(goes_on)  # and does not begin again with the run's seed
+    model.learn(STEPS - done - 1, checkpoints, reset_num_timesteps=False)
     assert (buffer.timeouts[done - 1] == 1).all()
     assert model.num_timesteps == STEPS
 

@@ -152,6 +152,32 @@ def test_run_killed_twice_ends_as_one_never_killed(run, demo, tmp_path, monkeypa
     assert "has learned all its steps" in capsys.readouterr().err
 
 
+def test_run_killed_before_its_second_checkpoint_ends_as_one_never_killed(
+    words, tmp_path, monkeypatch
+):
+    """The first is of step 0: it is gone on from, and its log begins anew."""
+    words += ["--set", "env_kwargs.frozen=false", "--set", "eval_freq=20"]
+    whole, killed = tmp_path / "run", tmp_path / "killed"
+    assert main([*words, "--steps", "80"]) == 0
+    step = TrainingCallback._on_step
+
+    def on_step(self):
+        if self.num_timesteps == 70:
+            raise Killed
+        return step(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingCallback, "_on_step", on_step)
+        with pytest.raises(Killed):
+            main([*words, "--steps", "80", "--out", str(killed)])
+    assert rows(killed)
+    assert main(["train", "--resume", str(killed), "--episodes", "2"]) == 0
+    one, other = (TD3BC.load(f / "model.zip").get_parameters() for f in (whole, killed))
+    for name, values in one["policy"].items():
+        assert torch.equal(values, other["policy"][name]), name
+    assert len(rows(whole)) == len(rows(killed))
+
+
 def test_two_runs_in_one_folder_are_refused(demo, tmp_path, capsys):
     folder = tmp_path / "run"
     folder.mkdir()
