@@ -3,6 +3,7 @@
 * ``Played`` - what came of one episode
 * ``play`` - plays one
 * ``check_replay`` - the demonstration's actions lead where its pictures show, and as fast
+* ``check_success`` - the environment says what success is
 * ``check_guide`` - how often guided replay succeeds, plain and corrected
 """
 
@@ -23,7 +24,7 @@ from regil_wrappers.reward_signals import Signal
 from regil_sb3.doctor.findings import Finding, listed
 from regil_sb3.doctor.pictures import is_idle
 
-__all__ = ["Act", "Played", "check_guide", "check_replay", "play"]
+__all__ = ["Act", "Played", "check_guide", "check_replay", "check_success", "play"]
 
 Actions = npt.NDArray[np.float32]
 Act = Callable[[int], Actions]
@@ -40,7 +41,8 @@ class Played:
     """One episode.
 
     Attributes:
-        success: whether it was solved.
+        success: whether it was solved, as training counts: ``info["is_success"]`` at any step.
+        says: whether any info had that key.
         rewards: by name, (steps,) each.
         embeddings: (steps + 1, D) float32, of its pictures.
         seconds: it took, all together.
@@ -48,6 +50,7 @@ class Played:
     """
 
     success: bool = False
+    says: bool = False
     rewards: dict[str, list[float]] = field(default_factory=dict)
     embeddings: list[npt.NDArray[np.float32]] = field(default_factory=list)
     seconds: float = 0.0
@@ -87,7 +90,8 @@ def play(
         played.embeddings.append(retriever.embedding)
         for name, signal in (rewards or {}).items():
             played.rewards[name].append(signal.step())
-        played.success |= bool(info.get("is_success", terminated))
+        played.success |= bool(info.get("is_success", False))
+        played.says |= "is_success" in info
         over = terminated or truncated
     played.seconds = time.perf_counter() - begun
     if env.has_wrapper_attr("film"):
@@ -157,6 +161,21 @@ def _rate_finding(misfits: dict[float, float], best: float) -> Finding:
         return Finding("frame rate", "warning", line)
     line = f"its actions, replayed, lead where its pictures show ({left:.0%} of the change missed)"
     return Finding("frame rate", "ok", line)
+
+
+def check_success(says: bool) -> list[Finding]:
+    """A finding where the environment never says whether it is solved.
+
+    Args:
+        says: whether any info of an episode had the key "is_success".
+    """
+    if says:
+        return []
+    line = (
+        'no info had the key "is_success", which is all that counts as a success: none would be '
+        'kept, none evaluated; let step() return info["is_success"], and terminate there'
+    )
+    return [Finding("success", "wrong", line)]
 
 
 def check_guide(plain: Sequence[bool], corrected: Sequence[bool] | None, said: str) -> Finding:

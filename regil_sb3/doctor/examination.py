@@ -26,7 +26,14 @@ from stable_baselines3.common.preprocessing import is_image_space
 import regil_sb3  # registers the environments  # noqa: F401
 from regil_sb3.as_seen import as_seen
 from regil_sb3.doctor.cost import check_cost
-from regil_sb3.doctor.episodes import Act, Played, check_guide, check_replay, play
+from regil_sb3.doctor.episodes import (
+    Act,
+    Played,
+    check_guide,
+    check_replay,
+    check_success,
+    play,
+)
 from regil_sb3.doctor.findings import Finding, listed, status, table
 from regil_sb3.doctor.page import write_page
 from regil_sb3.doctor.pictures import (
@@ -195,7 +202,7 @@ class _Episodes:
         self._env, self._demo, self._settings, self._say = env, demo, settings, say
         self._seeds = [SELECTION_SEED + i for i in range(episodes)]
         self._longest = max(200, 5 * len(demo))
-        self._steps, self._seconds = 0, 0.0
+        self._steps, self._seconds, self._says = 0, 0.0, False
 
     def examined(self, embedded: Embeddings) -> list[Finding]:
         """Findings, from the demonstration's embeddings on."""
@@ -226,6 +233,7 @@ class _Episodes:
                 said = f"calibration did not end in {_CALIBRATIONS} episodes"
             found.append(check_guide(plain, corrected, said))
         rewards = self._rewards(env, guided)
+        found += check_success(self._says)
         none = "nothing was replayed" if plain is None else "no replay failed"
         found += check_reward(rewards, self._settings.retrieval("reward"), none)
         words = ""
@@ -294,6 +302,7 @@ class _Episodes:
             warnings.simplefilter("ignore", UserWarning)
             played = play(env, seed, act, rewards, self._longest)
         self._steps, self._seconds = self._steps + played.steps, self._seconds + played.seconds
+        self._says |= played.says
         return played
 
     def _rewards(self, env: Any, guided: Sequence[Played]) -> list[Reward]:

@@ -265,6 +265,22 @@ def test_without_actions_it_is_still_judged_as_a_reward(demo):
     assert "correction" not in line(found, "recommended")
 
 
+class Silent(toy_camera.ToyCamera):
+    """Ends at success, and does not say that it was one."""
+
+    def step(self, action):
+        *rest, _ = super().step(action)
+        return (*rest, {})
+
+
+def test_an_environment_that_says_no_success(demo):
+    gym.register("ToySilent-v0", entry_point=Silent)
+    found = doctor.examine("ToySilent-v0", demo, 1)
+    gym.registry.pop("ToySilent-v0")
+    assert wrong(found) == ["guided replay", "success"]  # as training would count them
+    assert 'info["is_success"]' in line(found, "success")
+
+
 class Discrete(toy_camera.ToyCamera):
     """Buttons in place of numbers."""
 
