@@ -59,8 +59,9 @@ def as_seen(
         else observation_space.shape
     )
     if got != want:
+        stacked = f", {n_stack} stacked: set frame_stack=1" if n_stack > 1 else ""
         raise ValueError(
-            f"the demonstration's observations have shape {got} but the policy sees {want}"
+            f"the demonstration's observations have shape {got} but the policy sees {want}{stacked}"
         )
     return observations, actions.astype(np.float32)
 

@@ -232,7 +232,9 @@ def make_settings(
         overrides: "KEY=VALUE" with VALUE as YAML. KEY is an argument of the algorithm or of the
             retrieval wrappers, ``env_kwargs.NAME``, ``policy_kwargs.NAME``, or ``n_timesteps``
             (steps), ``n_envs``, ``frame_stack``, ``policy``, ``eval_episodes`` or ``eval_freq`` of
-            ``Settings``.
+            ``Settings``. With a policy other than "CnnPolicy" no frames are stacked and none of the
+            preset's ``policy_kwargs`` are taken, with "MultiInputPolicy" ``n_steps`` is 1, unless
+            they are given, too.
 
     Raises:
         ValueError: an unknown preset or key.
@@ -256,9 +258,16 @@ def make_settings(
     if settings.algo != "td3bc":  # another algorithm takes what it shares with ours
         settings.hyperparams = {k: v for k, v in settings.hyperparams.items() if k in known}
     settings.env_wrapper += changes.pop("env_wrapper", [])  # outside the others
-    if settings.policy != "CnnPolicy":  # other policies have no encoder that could be shared
+    given = pairs(overrides or [])
+    policy = given.get("policy", settings.policy)
+    if policy != "CnnPolicy":  # other policies have no encoder that could be shared
         changes = {k: v for k, v in changes.items() if not k.startswith("policy_kwargs.")}
-    for key, value in {**changes, **pairs(overrides or [])}.items():
+        if policy != settings.policy:  # the preset is made for pictures
+            settings.frame_stack = 1
+            settings.hyperparams.pop("policy_kwargs", None)
+            if policy == "MultiInputPolicy" and "n_steps" in known:
+                settings.hyperparams["n_steps"] = 1
+    for key, value in {**changes, **given}.items():
         _override(settings, key, value)
     if steps is not None:
         settings.steps = steps

@@ -22,6 +22,7 @@ from regil_wrappers.encoders import embed
 from regil_wrappers.frames import FrameSource
 from regil_wrappers.retrieval_wrapper import make_retriever, settings_of
 from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 import regil_sb3  # registers the environments  # noqa: F401
 from regil_sb3.as_seen import as_seen
@@ -142,7 +143,7 @@ def _seen(
     """What can be said without a step, and the demonstration's embeddings if pictures compare."""
     found = check_recorded(env, demo)
     found += check_actions(demo, env.action_space)
-    found += _observations(env, demo)
+    found += _observations(env, demo, settings.frame_stack)
     names = inspect.signature(settings_of).parameters
     own = {name: settings.retrieval(name) for name in names if name != "demo"}
     try:
@@ -166,13 +167,15 @@ def _seen(
     return found, embedded if np.ptp(embedded, axis=0).any() else None
 
 
-def _observations(env: Env, demo: Demonstration) -> list[Finding]:
+def _observations(env: Env, demo: Demonstration, n_stack: int) -> list[Finding]:
     """Whether a policy that sees no picture finds its observations in the demonstration."""
     space, box = env.observation_space, env.action_space
     if is_image_space(space) or demo.actions is None or not isinstance(box, gym.spaces.Box):
         return []
+    if n_stack > 1 and isinstance(space, gym.spaces.Box | gym.spaces.Dict):
+        space = StackedObservations(1, n_stack, space).stacked_observation_space
     try:
-        as_seen(demo, space, box, 1)
+        as_seen(demo, space, box, n_stack)
     except ValueError as error:
         return [Finding("observations", "warning", f"TD3BC cannot clone it: {error}")]
     return [Finding("observations", "ok", "those of a policy without camera are in it")]

@@ -346,14 +346,16 @@ def test_upside_down_demonstration_is_refused_before_the_run_begins(demo, tmp_pa
     assert not (folder / "config.yaml").exists()
 
 
-def test_dict_observations_from_recording_to_report(tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "BC_UPDATES", 3)
+@pytest.mark.parametrize(
+    ("obs", "image", "policy"),
+    [("dict", "obs:front", "MultiInputPolicy"), ("state", "render", "MlpPolicy")],
+)
+def test_other_observations_from_recording_to_report(obs, image, policy, tmp_path):
     demo, run = tmp_path / "demo.hdf5", tmp_path / "run"
-    assert main(["record", "ToyReach-v0", "-o", str(demo), "--env-kwargs", "obs=dict"]) == 0
+    assert main(["record", "ToyReach-v0", "-o", str(demo), "--env-kwargs", f"obs={obs}"]) == 0
     words = ["train", "--env", "ToyReach-v0", "--demo", str(demo), "--out", str(run)]
     changes = {
-        **{"env_kwargs.obs": "dict", "image": "obs:front", "policy": "MultiInputPolicy"},
-        **{"policy_kwargs": "{}", "frame_stack": 1, "n_steps": 1, "correction": "none"},
+        **{"env_kwargs.obs": obs, "image": image, "policy": policy, "correction": "none"},
         **{"register": "false", "disturbance": 0, "warmup_steps": 25, "learning_starts": 10},
         **{"bc_pretrain_steps": 2, "buffer_size": 200, "batch_size": 4, "eval_episodes": 1},
     }
@@ -369,6 +371,17 @@ def test_where_no_folder_can_be_locked_one_line_says_so(words, monkeypatch, caps
     monkeypatch.setitem(sys.modules, "fcntl", None)  # as on Windows
     assert main(words) == 2
     assert "regil: a run folder needs Linux or macOS" in capsys.readouterr().err
+
+
+def test_what_is_set_beside_a_policy_without_pictures_holds():
+    given = ["policy=MultiInputPolicy", "frame_stack=3", "n_steps=2", "policy_kwargs.net_arch=[8]"]
+    settings = make_settings("ToyReach-v0", overrides=given)
+    assert settings.frame_stack == 3
+    assert settings.hyperparams["n_steps"] == 2
+    assert settings.hyperparams["policy_kwargs"] == {"net_arch": [8]}
+    settings = make_settings("ToyReach-v0", "rfcl", overrides=["policy=MlpPolicy"])
+    assert settings.frame_stack == 1
+    assert {"n_steps", "policy_kwargs"}.isdisjoint(settings.hyperparams)
 
 
 def test_missing_demonstration_names_what_to_do(tmp_path, monkeypatch, capsys):

@@ -400,6 +400,15 @@ def test_state_observations_and_rendered_pictures(files, capsys):
     assert re.search(r"ok +guided replay", out)
 
 
+def test_state_observations_as_the_settings_stack_them(demo):
+    states = changed(demo, observations=np.zeros((len(demo), 6), np.float32))
+    seen = ["image=render", "env_kwargs.obs=state"]
+    for more, verdict in (([], "warning"), (["policy=MlpPolicy"], "ok")):
+        found = doctor.examine(make_settings(ENV, overrides=[*seen, *more]), states, 1)
+        assert verdicts(found)["observations"] == verdicts(found)["time"] == verdict
+        assert ("2 stacked: set frame_stack=1" in line(found, "observations")) == (not more)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
