@@ -90,6 +90,7 @@ def write_card(run: Path, repo: str = "OWNER/NAME") -> Path:
     except (OSError, ValueError) as error:
         raise ValueError(f"{run} has no evaluation ({error}): regil evaluate {run}") from error
     algorithm = ALGOS[settings.algo]
+    guided = settings.warmup_steps > 0 or settings.hyperparams.get("bc_coef") != 0
     found = {name: results[name] for name in METHODS if name in results}
     episodes = results["policy"]["episodes"]
     task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
@@ -126,7 +127,7 @@ def write_card(run: Path, repo: str = "OWNER/NAME") -> Path:
     card = _CARD.format(
         algorithm=algorithm.__name__,
         home="" if algorithm is TD3BC else ".baselines",
-        how=_HOW[settings.algo],
+        how=_HOW[settings.algo] if guided else "TD3 on a reward that compares pictures with it",
         unit="updates" if issubclass(algorithm, Offline) else "agent steps",
         front=yaml.safe_dump(front, sort_keys=False),
         env=settings.env,

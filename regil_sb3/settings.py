@@ -169,6 +169,19 @@ class Settings:
             _override(settings, key, value)
         return settings
 
+    def without_guide(self) -> Settings:
+        """The same for a demonstration without actions: the reward alone, as of ``ablation-rl``."""
+        settings = copy.deepcopy(self)
+        settings.env_wrapper = [
+            entry
+            for entry in settings.env_wrapper
+            if "regil_wrappers.RetrievalGuideWrapper" not in (entry, *entry)
+        ]
+        for key, value in comparisons()["ablation-rl"].items():
+            if self.policy == "CnnPolicy" or not key.startswith("policy_kwargs."):
+                _override(settings, key, value)
+        return settings
+
     def wrappers(self, demo: str) -> list[tuple[Any, dict[str, Any]]]:
         """Wrapper classes with their arguments, inner first; ours get ``demo``.
 

@@ -205,11 +205,20 @@ def _environments(settings: Settings, demo: Path) -> Iterator[tuple[VecEnv, VecE
 def train(settings: Settings, demo: Demonstration, run: Path) -> None:
     """Learn, and leave a run folder with config, demonstration, logs and models.
 
+    From a demonstration without actions `TD3BC` learns by the reward alone, and a line says so.
+
     Raises:
         ValueError: the folder holds a run already, or the settings do not fit.
         KeyboardInterrupt: passed on after everything is saved.
     """
     refuse_finished(run)
+    if demo.actions is None and settings.algo == "td3bc":
+        settings = settings.without_guide()
+        print(
+            "the demonstration has no actions: no guide, no warm-up and no behaviour cloning, "
+            "the reward alone is learned from",
+            file=sys.stderr,
+        )
     run.mkdir(parents=True, exist_ok=True)
     with locked(run):
         demo.save(run / "demo.hdf5")
@@ -373,7 +382,8 @@ def evaluate_run(
     """Evaluate a run's last and best model, both guides and BC, and write ``evaluation.json``.
 
     BC is trained here when the folder has no ``bc_model.zip`` yet. Beside a model that was cloned
-    from the demonstration alone, VINN-style replay is evaluated instead.
+    from the demonstration alone, VINN-style replay is evaluated instead. Without a demonstration's
+    actions there is neither guide nor BC.
 
     Args:
         run: the folder.
@@ -417,7 +427,7 @@ def evaluate_run(
             acts.append(("corrected_guide", guide_act, env))
         if offline and "vinn" in only and plain_env.has_attr("retriever"):
             acts.append(("vinn", vinn_act(demo, settings.retrieval("k")), plain_env))
-        if not offline and "bc" in only:
+        if not offline and "bc" in only and demo.actions is not None:
             acts.append(("bc", policy_act(_bc_model(settings, demo, env, run, trust)), env))
         acts = [act for act in acts if act[0] in only]
         filmed: Evaluation | None = None

@@ -180,7 +180,10 @@ def check_scene(
 def check_actions(demo: Demonstration, space: gym.Space[Any]) -> list[Finding]:
     """Whether the actions can be executed, and are of the size that the environment expects."""
     if demo.actions is None:
-        line = "it has none: it can reward, but not guide, and TD3BC cannot clone it"
+        line = (
+            "it has none: it can reward, but not guide, and TD3BC cannot clone it: regil train "
+            "learns from the reward alone"
+        )
         return [Finding("actions", "warning", line)]
     try:
         fitting_actions(space, [demo], demo)

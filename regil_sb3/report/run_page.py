@@ -70,8 +70,10 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
         except Exception as error:
             missing.append(f"calibration.json cannot be used: {' '.join(str(error).split())}")
     results = {name: evaluation[name] for name in METHODS if successes(evaluation.get(name))}
+    guided = demo is None or demo.actions is not None
     if evaluation:
-        absent = [METHODS[name] for name in _EXPECTED if name not in results]
+        expected = _EXPECTED if guided else _EXPECTED[:1]
+        absent = [METHODS[name] for name in expected if name not in results]
         if absent:
             missing.append(f"not evaluated: {', '.join(absent)}")
     if not rows:
@@ -94,7 +96,7 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
     films = film_player(demo, episode, alignment)
     below = [
         card("An evaluation episode beside the demonstration", films, "wide"),
-        card("What the success buffer holds", _kept(found.kept), "wide"),
+        card("What the success buffer holds", _kept(found.kept, guided), "wide"),
         card("Configuration", config_table(found.config), "wide"),
     ]
     columns = "".join(f'<div class="column">{"".join(cards)}</div>' for cards in (left, right))
@@ -208,19 +210,24 @@ def _strips(results: dict[str, dict[str, Any]], evaluation: dict[str, Any]) -> s
     return "".join(strips) + f'<p class="soft small">{note}</p>'
 
 
-def _kept(kept: SuccessFilms | None) -> str:
-    """The success buffer's episodes: their films, how many there are and how long."""
+def _kept(kept: SuccessFilms | None, guided: bool) -> str:
+    """The success buffer's episodes: their films, how many there are and how long.
+
+    Args:
+        kept: what is known of them.
+        guided: whether the demonstration is the first.
+    """
     if kept is None or not kept.lengths:
         return ""
     lengths = kept.lengths
     note = (
         f"{len(lengths):,} episodes of {min(lengths)} to {max(lengths)} steps, "
-        f"{sum(lengths):,} steps in all, the demonstration first, then from old to new"
+        f"{sum(lengths):,} steps in all, {'the demonstration first, then ' * guided}from old to new"
     )
     if len(kept.shown) < len(lengths):
         note += f"; {len(kept.shown)} of them are shown"
     films = [
-        ("the demo" if i == 0 else f"no. {i}, {lengths[i]} steps", film)
+        ("the demo" if guided and i == 0 else f"no. {i}, {lengths[i]} steps", film)
         for i, film in zip(kept.shown, kept.films, strict=True)
     ]
     return f'<p class="soft small">{note}.</p>{mosaic(films)}'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import functools
 import json
 import os
@@ -19,6 +20,7 @@ from regil_wrappers import Demonstration
 from regil_sb3 import TD3BC, training
 from regil_sb3.checkpoint import CheckpointCallback
 from regil_sb3.cli import main
+from regil_sb3.evaluation import METHODS
 from regil_sb3.run_folder import locked, save_model
 from regil_sb3.settings import Settings, make_settings, presets
 from regil_sb3.training import TrainingCallback, make_env
@@ -371,6 +373,28 @@ def test_where_no_folder_can_be_locked_one_line_says_so(words, monkeypatch, caps
     monkeypatch.setitem(sys.modules, "fcntl", None)  # as on Windows
     assert main(words) == 2
     assert "regil: a run folder needs Linux or macOS" in capsys.readouterr().err
+
+
+def test_a_demonstration_without_actions(words, tmp_path, capsys):
+    """It learns from the reward alone, with what was asked of the guide left out."""
+    demo, run = tmp_path / "reach.hdf5", tmp_path / "run"
+    dataclasses.replace(Demonstration.load(demo), actions=None).save(demo)
+    assert main([*words, "--steps", "90"]) == 0
+    assert "the demonstration has no actions: no guide" in capsys.readouterr().err
+    settings = Settings.load(run / "config.yaml")
+    assert [w.__name__ for w, _ in settings.wrappers("d")] == ["RetrievalRewardWrapper"]
+    assert (settings.hyperparams["bc_coef"], settings.warmup_steps) == (0, 0)
+    assert settings.hyperparams["policy_kwargs"]["shared_encoder"]  # or nothing would train it
+    assert any(row["eval/success_rate"] for row in rows(run))
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 0
+    found = json.loads((run / "evaluation.json").read_text())
+    assert {"policy", "best_policy"} == set(found) & set(METHODS)
+    page = (run / "report.html").read_text()
+    assert "not evaluated: " not in page
+    assert "TD3 on a reward that compares pictures with it" in (run / "README.md").read_text()
+    model = TD3BC.load(run / "model.zip")
+    assert model.num_timesteps == 90
+    assert not model.success_buffer.episodes
 
 
 def test_what_is_set_beside_a_policy_without_pictures_holds():

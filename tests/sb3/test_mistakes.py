@@ -143,7 +143,7 @@ COMMANDS = [
     (["train", "--env", TOY, "--demo", "nothing-in-it.hdf5", "--out", "new"], "nothing-in-it"),
     (["train", "--env", TOY, "--demo", "nan.hdf5", "--out", "new"], "NaN"),
     (["train", "--env", TOY, "--demo", "80.hdf5", "--out", "new"], "80x80"),
-    (["train", "--env", TOY, "--demo", "no-actions.hdf5", "--out", "new"], "no actions"),
+    (train("--preset", "bc", "--demo", "no-actions.hdf5"), "no actions"),
     (["train", "--env", TOY, "--demo", "four-actions.hdf5", "--out", "new"], "action"),
     (["train", "--env", TOY, "--demo", "other-units.hdf5", "--out", "new"], "action"),
     (["train", "--env", STATES, "--demo", "good.hdf5", "--out", "new"], "image"),

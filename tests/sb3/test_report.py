@@ -1,6 +1,7 @@
 """The report of a synthetic run: what the page has, what it says is missing, what is refused."""
 
 import base64
+import dataclasses
 import json
 import re
 from html.parser import HTMLParser
@@ -158,6 +159,16 @@ def test_pictures_of_the_successbuffer_of(tmp_path):
     states.add(np.zeros((9, 3), np.float32), np.zeros((9, 2), np.float32))
     save_films(states, tmp_path / "states.npz")
     assert (load_films(tmp_path / "states.npz").lengths, kept.shown[:2]) == ([9], [0, 3])
+
+
+def test_a_demonstration_without_actions_is_not_in_the_success_buffer(run):
+    page = write_report(run).read_text()
+    assert "the demonstration first, then from old to new" in page
+    assert '"name": "the demo"' in page
+    dataclasses.replace(film(30, 0), actions=None).save(run / "demo.hdf5")
+    page = write_report(run).read_text()
+    assert "steps in all, from old to new" in page
+    assert '"name": "the demo"' not in page
 
 
 def test_rewards_are_the_runs_own(run):
