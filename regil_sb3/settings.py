@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper, make_encoder
 from regil_wrappers.encoders import runs_code
+from regil_wrappers.encoders.options import absolute
 
 from regil_sb3.baselines import BAKU, BC, ROT, ReverseForwardCurriculum
 from regil_sb3.files import replacing
@@ -247,7 +248,7 @@ def make_settings(
             (steps), ``n_envs``, ``frame_stack``, ``policy``, ``eval_episodes`` or ``eval_freq`` of
             ``Settings``. With a policy other than "CnnPolicy" no frames are stacked and none of the
             preset's ``policy_kwargs`` are taken, with "MultiInputPolicy" ``n_steps`` is 1, unless
-            they are given, too.
+            they are given, too. An encoder's file is kept with its path from the root.
 
     Raises:
         ValueError: an unknown preset or key.
@@ -282,6 +283,10 @@ def make_settings(
                 settings.hyperparams["n_steps"] = 1
     for key, value in {**changes, **given}.items():
         _override(settings, key, value)
+    for entry in settings.env_wrapper:  # the run may be gone on with from another folder
+        for arguments in entry.values() if isinstance(entry, dict) else ():
+            if isinstance(name := (arguments or {}).get("encoder"), str):
+                arguments["encoder"] = absolute(name)
     if steps is not None:
         settings.steps = steps
     for name in ("steps", "n_envs", "frame_stack", "eval_episodes", "eval_freq"):

@@ -257,6 +257,8 @@ def test_presets_are_plain_yaml_and_fit():
         ("guide_patience=8", lambda s: s.wrappers("d")[0][1]["guide_patience"], 8),
         ("policy_kwargs.shared_encoder=true", lambda s: s.hyperparams["policy_kwargs"],
          {"shared_encoder": True, "q_trains_encoder": False}),
+        ("encoder=r3m-resnet18@w/r3m.pt", lambda s: {a["encoder"] for _, a in s.wrappers("d")},
+         {f"r3m-resnet18@{Path.cwd()}/w/r3m.pt"}),  # wherever it is gone on with
     ],
 )  # fmt: skip
 def test_overrides(override, where, value):

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from regil_wrappers import make_encoder, register_encoder
 from regil_wrappers.encoders import Preprocessing, encoder_names, runs_code
-from regil_wrappers.encoders.options import parse
+from regil_wrappers.encoders.options import absolute, parse
 
 pytestmark = pytest.mark.usefixtures("fresh_encoders")
 
@@ -153,3 +153,12 @@ def test_names_that_run_code() -> None:
     assert runs_code("os:system?command=true")
     assert runs_code("torchscript:net.pt")
     assert not any(map(runs_code, ("pixels", "timm:resnet18@x:y.pth", "dinov3@a:b?whiten=3")))
+
+
+def test_a_file_in_a_name_is_told_from_the_root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("r3m-resnet18@{}r3m-resnet18?batch=8", "torchscript:{}a.pt?batch=2", "pixels?x=a"):
+        told = absolute(name.format("w/"))
+        assert told == name.format(f"{tmp_path}/w/")
+        assert absolute(told) == told
+    assert absolute("pixels") == "pixels"

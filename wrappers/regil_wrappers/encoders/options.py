@@ -4,6 +4,7 @@
 ``"dinov2-small?features=patches&whiten=32"`` or ``"r3m-resnet18@weights/r3m.pt?batch=8"``.
 
 * ``parse`` - takes it apart
+* ``absolute`` - the same name wherever it is read
 * ``one_of``, ``whole_number``, ``fraction`` - what an option may be
 """
 
@@ -11,9 +12,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-__all__ = ["fraction", "one_of", "parse", "whole_number"]
+__all__ = ["absolute", "fraction", "one_of", "parse", "whole_number"]
 
 _OPTION = re.compile(r"([A-Za-z_]\w*)=(.+)")
 _WORDS: dict[str, Any] = {"true": True, "false": False, "none": None}
@@ -50,6 +52,21 @@ def parse(text: str) -> tuple[str, str | None, dict[str, Any]]:
         return text, None, options
     name, _, file = text.partition("@")
     return name, file or None, options
+
+
+def absolute(text: str) -> str:
+    """The same name with the path of its file, where it has one, from the root.
+
+    Raises:
+        ValueError: as of `parse`.
+    """
+    name, file, _ = parse(text)
+    mark = "torchscript:" if name.startswith("torchscript:") else "@"
+    file = name.removeprefix(mark) if mark != "@" else file
+    if not file:
+        return text
+    head, _, rest = text.partition(mark)
+    return f"{head}{mark}{Path(file).absolute()}{rest.removeprefix(file)}"
 
 
 def _value(text: str) -> Any:
