@@ -285,8 +285,8 @@ def make_settings(
         _override(settings, key, value)
     for entry in settings.env_wrapper:  # the run may be gone on with from another folder
         for arguments in entry.values() if isinstance(entry, dict) else ():
-            if isinstance(name := (arguments or {}).get("encoder"), str):
-                arguments["encoder"] = absolute(name)
+            if isinstance(encoder := (arguments or {}).get("encoder"), str):
+                arguments["encoder"] = absolute(encoder)
     if steps is not None:
         settings.steps = steps
     for name in ("steps", "n_envs", "frame_stack", "eval_episodes", "eval_freq"):
