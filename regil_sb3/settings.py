@@ -183,6 +183,24 @@ class Settings:
                 _override(settings, key, value)
         return settings
 
+    def defaults(self) -> dict[str, dict[str, Any]]:
+        """What algorithm and wrappers take where nothing is said, by the names of their classes.
+
+        Another version may take other values: with the settings these are all that a run has.
+        """
+        algorithm = ALGOS[self.algo]
+        policy = algorithm.policy_aliases.get(self.policy)
+        made = [(algorithm, self.hyperparams), *self.wrappers("")]
+        made += [] if policy is None else [(policy, self.hyperparams.get("policy_kwargs") or {})]
+        return {
+            of.__name__: {
+                name: _plain(argument.default)
+                for name, argument in inspect.signature(of).parameters.items()
+                if name not in given and argument.default is not argument.empty and name[0] != "_"
+            }
+            for of, given in made
+        }
+
     def wrappers(self, demo: str) -> list[tuple[Any, dict[str, Any]]]:
         """Wrapper classes with their arguments, inner first; ours get ``demo``.
 
@@ -329,6 +347,15 @@ def _value(text: str) -> Any:
             return value
         return int(number) if number.is_integer() and "." not in value else number
     return value
+
+
+def _plain(value: Any) -> Any:
+    """As YAML holds it; of what it does not, the name."""
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    return getattr(value, "__name__", str(value))
 
 
 def _is_in(module: str, run: Path) -> bool:

@@ -237,6 +237,7 @@ def train(settings: Settings, demo: Demonstration, run: Path) -> None:
                 horizon=settings.retrieval("horizon"),
                 action_repeat=action_repeat(env),
                 demo_actions=None if demo.actions is None else len(demo.actions),
+                defaults=settings.defaults(),
             )
             _learn(model, settings, run, eval_env)
 

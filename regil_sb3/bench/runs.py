@@ -28,6 +28,7 @@ from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
 from tqdm import tqdm
 
 from regil_sb3.bench.machine import describe
@@ -199,8 +200,8 @@ def machines(runs: Sequence[Run]) -> list[str]:
 def others(runs: Sequence[Run]) -> list[str]:
     """A line for each run that is not the one that is asked for now.
 
-    Of one that is finished or begun, other settings; of one whose model is gone, an evaluation that
-    is not enough.
+    Of one that is finished or begun, other settings or defaults; of one whose model is gone, an
+    evaluation that is not enough.
     """
     from regil_sb3.settings import Settings
 
@@ -209,7 +210,8 @@ def others(runs: Sequence[Run]) -> list[str]:
         if not (config := run.folder / "config.yaml").exists():
             continue
         then, now = asdict(Settings.load(config, trust=True)), asdict(run.settings_now)
-        if differ := [name for name in now if then[name] != now[name]]:
+        differ = [name for name in now if then[name] != now[name]]
+        if differ := differ or _other_defaults(run, config):
             lines.append(
                 f"{run.folder} was made with other settings ({', '.join(differ)}): "
                 "remove it, and it is made again, or name another --out"
@@ -222,6 +224,18 @@ def others(runs: Sequence[Run]) -> list[str]:
                 "and its model is gone: remove it, and it is made again, or name another --out"
             )
     return lines
+
+
+def _other_defaults(run: Run, config: Path) -> list[str]:
+    """What its constructors' defaults were otherwise; runs of older versions do not say them."""
+    then = yaml.safe_load(config.read_text("utf-8")).get("defaults") or {}
+    now = run.settings_now.defaults()
+    return [
+        f"the default of {of}'s {name}"
+        for of, arguments in now.items()
+        for name, value in arguments.items()
+        if name in then.get(of, {}) and then[of][name] != value
+    ]
 
 
 def predicted_hours(runs: Sequence[Run], workers: int) -> float:

@@ -24,7 +24,7 @@ __all__ = ["NOTE", "methods", "plots", "scores", "write_comparison"]
 
 _COLOURS = 6  # as many as the page has for methods
 _STYLES = ("solid", "dashed", "dotted")  # of lines: a colour comes once in each
-_NOT_COMPARED = ("env", "seed", "versions.")
+_NOT_COMPARED = ("env", "seed", "versions.", "defaults.")
 _NAMED = 2  # settings in a method's name
 
 NOTE = (

@@ -97,7 +97,7 @@ def write_report(run: Path | str, out: Path | str | None = None) -> Path:
     below = [
         card("An evaluation episode beside the demonstration", films, "wide"),
         card("What the success buffer holds", _kept(found.kept, guided), "wide"),
-        card("Configuration", config_table(found.config), "wide"),
+        card("Configuration", _configuration(found.config), "wide"),
     ]
     columns = "".join(f'<div class="column">{"".join(cards)}</div>' for cards in (left, right))
     write_page(
@@ -208,6 +208,14 @@ def _strips(results: dict[str, dict[str, Any]], evaluation: dict[str, Any]) -> s
         return ""
     note = "One square per unseen seed, the same seeds in each row; filled means success."
     return "".join(strips) + f'<p class="soft small">{note}</p>'
+
+
+def _configuration(config: dict[str, Any]) -> str:
+    """What was said, and folded up below it what was left to the constructors."""
+    said = {key: value for key, value in config.items() if key != "defaults"}
+    defaults = config_table(config.get("defaults") or {})
+    folded = f"<details><summary>Defaults</summary>{defaults}</details>" if defaults else ""
+    return config_table(said) + folded
 
 
 def _kept(kept: SuccessFilms | None, guided: bool) -> str:

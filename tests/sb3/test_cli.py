@@ -82,6 +82,12 @@ def test_config_makes_the_run_again(run):
     settings = Settings.load(run / "config.yaml")
     again = make_settings(ENV, None, 0, 260, TINY[1:12:2])
     assert settings == again
+    said = yaml.safe_load((run / "config.yaml").read_text())["defaults"]
+    assert said == again.defaults()  # another version may have others
+    assert said["TD3BC"]["tau"] == 0.005
+    assert "warmup_steps" not in said["TD3BC"]  # it was set
+    assert said["ImagePolicy"]["random_shift"] == 4
+    assert said["RetrievalGuideWrapper"]["step_pattern"] == "symmetric"
 
 
 def test_evaluate_and_report_again(run, capsys):

@@ -23,6 +23,7 @@ from regil_sb3.bench import runs as runs_module
 from regil_sb3.bench.runs import Run, finish_all, machines, others, predicted_hours, seconds_of
 from regil_sb3.cli import main
 from regil_sb3.run_folder import has_checkpoint, locked
+from regil_sb3.settings import Settings
 
 TINY = (
     "warmup_steps=60",
@@ -72,11 +73,17 @@ def test_runs_are_finished_once_and_failures_are_named(runs, failed):
     assert "commit" in machines(runs)[0]
 
 
-def test_runs_that_were_made_otherwise_are_named(runs, failed):
+def test_runs_that_were_made_otherwise_are_named(runs, failed, monkeypatch):
     assert others(runs) == []
     changed = replace(runs[0], settings=(*TINY[:-1], "eval_episodes=3", "k=4"))
     (line,) = others([changed, runs[1]])
     assert line.startswith(f"{runs[0].folder} was made with other settings (eval_episodes, ")
+    with monkeypatch.context() as patch:
+        make = runs[0].settings_now.defaults()
+        make["TD3BC"] |= {"tau": 0.1, "added later": 3}
+        patch.setattr(Settings, "defaults", lambda _: make)
+        (line,) = others([runs[0]])
+        assert "was made with other settings (the default of TD3BC's tau): remove it" in line
     assert replace(runs[0], episodes=2).finished  # fewer of the same
     assert len(list(run_tables.raw([replace(runs[0], episodes=2)]))) == 2
     for more in ({"episodes": 4}, {"beside": (("replay", "guide"),)}):  # its model is there
