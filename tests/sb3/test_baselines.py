@@ -353,7 +353,7 @@ def test_a_curriculum_refuses(corner):
         ReverseForwardCurriculum(Start(), other).reset()
 
 
-BC_TRAINS = ("bc", "baku", "ablation-reg-bc", "reward-", "regil-plain")
+BC_TRAINS = ("bc", "baku", "ablation-reg-bc", "reward-")
 """Presets whose encoder behaviour cloning trains, as ours."""
 
 

@@ -133,7 +133,7 @@ def test_without_actions(demo):
     ("overrides", "why"),
     [
         (["env_kwargs.obs=dict"], "MultiInputPolicy"),
-        (["policy=MlpPolicy"], "shared_encoder"),
+        (["policy=MlpPolicy", "policy_kwargs.shared_encoder=true"], "shared_encoder"),
         (["batch_size=0"], "batch_size is 0"),
         (["learning_rate=1000000.0"], "training stopped"),
     ],
