@@ -177,6 +177,15 @@ def _said(what: str, found: Rank) -> str:
     return f"{what}: {found.rho:+.2f} (p {found.p:.3f}) of {found.n} warm-ups"
 
 
+def _left_out(lines: Sequence[str]) -> str:
+    """Runs that are left out, by why."""
+    runs: dict[str, list[str]] = {}
+    for line in lines:
+        run, _, why = line.partition(": ")
+        runs.setdefault(why, []).append(Path(run).name)
+    return "".join(f"Left out ({why}): {', '.join(names)}. " for why, names in runs.items())
+
+
 def _draw(runs: Sequence[Learned], path: Path) -> None:
     with figure(path) as ((axis,),):
         for i, task in enumerate(dict.fromkeys(run.task for run in runs)):
@@ -225,7 +234,7 @@ def main(runs: Sequence[str] = (), out: str = "bench", dry_run: bool = False) ->
         "demonstration left out. Success: last policy, unseen episodes, Wilson's interval. "
         "Spearman's rank correlation of both, runs with the same warm-up counted once: "
         f"{'; '.join(ranks)}. "
-        + "".join(f"Left out: {line}. " for line in left_out)
+        + _left_out(left_out)
         + f"Read by {describe(('numpy', 'scipy', 'regil-sb3'))}"
     )
     folder = Path(out)
