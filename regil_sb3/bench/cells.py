@@ -24,15 +24,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from regil_sb3.bench.machine import describe, together
+from regil_sb3.bench.machine import SIMULATORS, describe, together
 from regil_sb3.files import replacing
 
-__all__ = ["Cell", "below", "finish", "predicted_hours", "rows"]
+__all__ = ["Cell", "below", "finish", "kind_of", "predicted_hours", "rows"]
 
-_SIMULATORS = {"libero": ("hf-libero", "robosuite"), "robosuite": ("robosuite",)}
+_OF_KIND = {"libero": ("hf-libero", "robosuite"), "robosuite": ("robosuite",)}
 _DECIDE = ("gymnasium", "mujoco", "regil-sb3", "regil-wrappers")
-_HERE = ("metaworld", "hf-libero", "robosuite", "mujoco")  # simulators
-_SAID = ("gymnasium", *_HERE, "numpy", "timm", "torch", "regil-sb3")
+_SAID = ("gymnasium", *SIMULATORS, "numpy", "timm", "torch", "regil-sb3")
 
 
 @dataclass(frozen=True)
@@ -88,11 +87,15 @@ class Cell:
         return found
 
 
+def kind_of(env: str) -> str:
+    """What an environment's id begins with: "metaworld", "libero", "robosuite", "rehearsal", ..."""
+    return env.removeprefix("regil/").partition("-")[0]
+
+
 def _versions(env: str) -> dict[str, str]:
     """Of the packages that decide what is found in an environment."""
-    kind = env.removeprefix("regil/").partition("-")[0]
     found = {}
-    for name in (*_DECIDE, *_SIMULATORS.get(kind, ("metaworld",))):
+    for name in (*_DECIDE, *_OF_KIND.get(kind_of(env), ("metaworld",))):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import psutil
 
-__all__ = ["describe", "together"]
+__all__ = ["SIMULATORS", "describe", "together"]
 
+SIMULATORS = ("metaworld", "hf-libero", "robosuite", "mujoco")
+"""Distributions that tasks are simulated with."""
 _CODE = [f":/{folder}" for folder in ("regil_sb3", "wrappers", "zoo_configs")]
 
 

@@ -18,6 +18,7 @@ from regil_wrappers import Demonstration, RetrievalGuideWrapper
 from regil_wrappers.encoders import make_encoder
 
 import regil_sb3  # registers the environments  # noqa: F401
+from regil_sb3.bench.cells import kind_of
 from regil_sb3.envs import METAWORLD_TASKS
 from regil_sb3.recording import check_seeds, record_expert
 from regil_sb3.settings import make_settings, presets
@@ -72,7 +73,7 @@ def task_of(env: str) -> str:
 
 def benchmark(tasks: Iterable[str]) -> str:
     """Which of the paper's benchmarks all these tasks are of; "": of none, or of several."""
-    kinds = {env_id(task).removeprefix("regil/").partition("-")[0] for task in tasks}
+    kinds = {kind_of(env_id(task)) for task in tasks}
     return kinds.pop() if len(kinds) == 1 and kinds <= {"metaworld", "libero"} else ""
 
 

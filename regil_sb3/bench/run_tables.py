@@ -82,10 +82,11 @@ def planned(
         for method, asked in own["methods"].items()
         if not methods or method in methods
     ]
-    warmups = {run.method: run.settings_now.warmup_steps for run in runs}
-    if short := [f"{name}'s of {n}" for name, n in warmups.items() if runs[0].steps <= n]:
-        told = ", ".join(short)
-        raise ValueError(f"--steps {runs[0].steps} end before the warm-up does ({told}): take more")
+    for run in {(run.env, run.method): run for run in runs}.values():  # of any seed
+        if run.steps <= (warmup := run.settings_now.warmup_steps):
+            raise ValueError(
+                f"--steps {run.steps} end before {run.method}'s warm-up of {warmup} does: take more"
+            )
     return runs
 
 

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from tqdm import tqdm
 
-from regil_sb3.bench.machine import describe
+from regil_sb3.bench.machine import SIMULATORS, describe
 from regil_sb3.bench.on_ray import SHOWN_EVERY, Shares, call_all, connect
 from regil_sb3.files import replacing
 
@@ -49,8 +49,7 @@ __all__ = [
     "seconds_of",
 ]
 
-_SIMULATORS = ("metaworld", "hf-libero", "robosuite", "mujoco")
-_PACKAGES = ("gymnasium", *_SIMULATORS, "stable-baselines3", "torch", "regil-sb3")
+_PACKAGES = ("gymnasium", *SIMULATORS, "stable-baselines3", "torch", "regil-sb3")
 
 _SECONDS_A_STEP = 15 * 60 / 15_000  # of one core, until a run has told
 _GRACE = 60.0  # s that an interrupted run is given to save itself
