@@ -23,6 +23,7 @@ __all__ = [
     "EVALUATION_SEEDS",
     "NoExpertError",
     "Recorder",
+    "action_limits",
     "check_seeds",
     "make_env",
     "record_expert",
@@ -240,8 +241,7 @@ class Recorder:
             metadata={
                 **{name: ours[name] for name in kept if name in ours},
                 "env_id": env_id,
-                "action_low": _limits(self.space.low),
-                "action_high": _limits(self.space.high),
+                **action_limits(self.space),
                 "seed": self.seed,
                 # only what took part in this recording
                 "versions": {
@@ -254,9 +254,10 @@ class Recorder:
         )
 
 
-def _limits(values: npt.NDArray[np.floating[Any]]) -> list[float] | None:
+def action_limits(space: gym.spaces.Box) -> dict[str, list[float] | None]:
     """As metadata holds them: None where not all are finite."""
-    return values.tolist() if np.isfinite(values).all() else None
+    sides = {"action_low": space.low, "action_high": space.high}
+    return {name: v.tolist() if np.isfinite(v).all() else None for name, v in sides.items()}
 
 
 def is_picture(space: gym.Space[Any]) -> bool:

@@ -41,6 +41,7 @@ from regil_sb3.evaluation import (
 )
 from regil_sb3.files import replacing
 from regil_sb3.logs import AppendingCSV, Forgiving
+from regil_sb3.recording import action_limits
 from regil_sb3.report.success_films import save_films
 from regil_sb3.run_folder import (
     best_so_far,
@@ -460,10 +461,8 @@ def _save_film(
 ) -> None:
     """Keep an evaluation's first episode as a demonstration; what is none costs the film alone."""
     assert isinstance(space, spaces.Box)
-    bounded = bool(np.isfinite([space.low, space.high]).all())
     own = {
-        "action_low": space.low.tolist() if bounded else None,
-        "action_high": space.high.tolist() if bounded else None,
+        **action_limits(space),
         "image_size": None,  # what the policy sees may be of another than what is compared
         "seed": EVALUATION_SEED,
     }
