@@ -203,6 +203,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="RUN",
         help="trajectories, buffer-vs-learning: run folders (the latter: those in --out)",
     )
+    bench.add_argument(
+        "--trust",
+        action="store_true",
+        default=None,
+        help="trajectories: runs may name anything, and so run code",
+    )
     bench.add_argument("--out", help="where runs and cells are kept (bench; faults: faults)")
     bench.add_argument(
         "--dry-run",

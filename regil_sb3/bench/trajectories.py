@@ -184,14 +184,15 @@ def _policy(hands: _Hands, model: Any, episodes: int) -> list[Trajectory]:
     return found
 
 
-def played(run: RunContents, episodes: int) -> Played:
+def played(run: RunContents, episodes: int, trust: bool = False) -> Played:
     """Play a run's demonstration, warm-up and policy.
 
     Args:
         run: of `_checked`.
         episodes: of the policy.
+        trust: as in ``regil_sb3.training.evaluate_run``.
     """
-    settings = Settings.load(run.folder / "config.yaml")
+    settings = Settings.load(run.folder / "config.yaml", trust)
     demo, demo_file = run.demo, run.folder / "demo.hdf5"
     assert demo is not None
     with closing(make_env(settings, demo_file, n_envs=1)) as env:
@@ -200,13 +201,13 @@ def played(run: RunContents, episodes: int) -> Played:
         if settings.warmup_steps:
             with closing(make_env(settings, demo_file)) as guided:
                 paths += _warmup(_Hands(guided), settings.seed, settings.warmup_steps)
-        model = ALGOS[settings.algo].load(run.folder / "model.zip", buffer_size=1)
+        model = ALGOS[settings.algo].load(run.folder / "model.zip", trust=trust, buffer_size=1)
         paths += _policy(hands, model, episodes)
     kept = buffer_after_warmup(run, settings.warmup_steps) if settings.warmup_steps else 0
     return Played(str(run.folder), task_of(settings.env), hands.unit, hands.simulated, paths, kept)
 
 
-def _checked(folder: str) -> RunContents:
+def _checked(folder: str, trust: bool) -> RunContents:
     """A run that can be played again.
 
     Raises:
@@ -220,7 +221,7 @@ def _checked(folder: str) -> RunContents:
             f"--runs {folder}: its demonstration cannot be played again (demo.hdf5 is missing, or "
             "holds no actions or no seed)"
         )
-    settings = Settings.load(run.folder / "config.yaml")
+    settings = Settings.load(run.folder / "config.yaml", trust)
     try:
         with closing(make_env(settings, run.folder / "demo.hdf5", n_envs=1)) as env:
             _Hands(env)
@@ -309,7 +310,11 @@ def _how(run: Played) -> str:
 
 
 def main(
-    runs: Sequence[str] = (), out: str = "bench", episodes: int = 10, dry_run: bool = False
+    runs: Sequence[str] = (),
+    out: str = "bench",
+    episodes: int = 10,
+    dry_run: bool = False,
+    trust: bool = False,
 ) -> None:
     """Play runs again, and print the table.
 
@@ -318,6 +323,7 @@ def main(
         out: folder of ``trajectories.md``, ``.tex``, ``.parquet`` (a row a point) and ``.png``.
         episodes: of the policy, the first unseen ones.
         dry_run: print the runs and the predicted hours, and play none.
+        trust: whether configs and models may name anything, and so run code (`regil evaluate`).
 
     Raises:
         ValueError: there is no run, or one cannot be played again.
@@ -327,16 +333,18 @@ def main(
     if not runs:
         raise ValueError("--runs is missing: name a run that has ended")
     check((), (), episodes=episodes)
-    contents = [_checked(run) for run in runs]
+    contents = [_checked(run, trust) for run in runs]
     if dry_run:
-        warmups = [Settings.load(run.folder / "config.yaml").warmup_steps for run in contents]
+        warmups = [
+            Settings.load(run.folder / "config.yaml", trust).warmup_steps for run in contents
+        ]
         hours = _STEP_S * sum(warmup + episodes * _LENGTH for warmup in warmups) / 3600
         print("\n".join(str(run.folder) for run in contents))
         print(f"{len(contents)} runs to play: about {hours:.2f} hours, one after the other")
         return
     need_parquet(name)
     begun = time.perf_counter()
-    found = [played(run, episodes) for run in contents]
+    found = [played(run, episodes, trust) for run in contents]
     minutes = (time.perf_counter() - begun) / 60
     lines = table(found)
     packages = ("gymnasium", "metaworld", "mujoco", "numpy", "torch", "regil-sb3")

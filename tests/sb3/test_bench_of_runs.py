@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 
 import made_run
 import numpy as np
@@ -215,6 +216,28 @@ def test_trajectories_from_the_command_line(toy_run, tmp_path, monkeypatch, caps
     assert all(row["x"] == row["y"] == 0 for row in rows if row["step"] == 0)
     assert (tmp_path / "trajectories.png").stat().st_size > 5_000
     assert said.rstrip().endswith((tmp_path / "trajectories.md").read_text().rstrip()[-80:])
+
+
+def test_trajectories_of_an_encoder_of_ones_own(toy_run, tmp_path, monkeypatch, capsys):
+    """Code that a run names runs with --trust alone, as in `regil evaluate`."""
+    told(monkeypatch, translation_dims=[0, 1])
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_encoder.py").write_text(
+        "from regil_wrappers import make_encoder\n\n\n"
+        "def pixels():\n    return make_encoder('pixels')\n"
+    )
+    run = shutil.copytree(toy_run, tmp_path / "own")
+    config = run / "config.yaml"
+    named = config.read_text().replace("encoder: pixels", "encoder: own_encoder:pixels")
+    config.write_text(named)
+    assert "own_encoder" in named
+    words = ["bench", "trajectories", "--out", str(tmp_path), "--episodes", "1", "--runs", str(run)]
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "names code to run, encoder 'own_encoder:pixels'" in line
+    assert "own_encoder" not in sys.modules
+    assert main([*words, "--trust"]) == 0
+    assert "| policy | 1 |" in capsys.readouterr().out
 
 
 def test_bad_options_get_one_line_before_anything_is_played(toy_run, tmp_path, monkeypatch, capsys):
