@@ -105,8 +105,8 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--env", help="id of the environment")
     train.add_argument(
         "--algo",
-        choices=["td3bc", "bc", "rot", "baku"],
-        help="takes the preset of its name (td3bc)",
+        choices=["td3bc", "td3bc-background", "bc", "rot", "baku"],
+        help="(td3bc); -background: updates beside control, for robots; others: with their preset",
     )
     train.add_argument("--demo", type=Path, help="demonstration; recorded when it is not there")
     train.add_argument("--seed", type=int, help="of all random generators (0)")
@@ -363,12 +363,7 @@ def _train(args: argparse.Namespace) -> None:
         if args.resume is not None:
             training.resume(run)
         else:
-            preset = args.preset or (None if args.algo == "td3bc" else args.algo)
-            settings = make_settings(args.env, preset, seed, args.steps, args.set)
-            if args.algo not in (None, settings.algo):
-                raise ValueError(
-                    f"--algo {args.algo}: preset {preset!r} is of {settings.algo}, leave one out"
-                )
+            settings = make_settings(args.env, args.preset, seed, args.steps, args.set, args.algo)
             refuse_finished(run)
             demo = args.demo or default_demo(args.env)
             if not demo.exists():

@@ -16,8 +16,7 @@ import yaml
 from regil_sb3.baselines import Offline
 from regil_sb3.evaluation import METHODS
 from regil_sb3.files import replacing
-from regil_sb3.settings import ALGOS, Settings
-from regil_sb3.td3bc import TD3BC
+from regil_sb3.settings import ALGOS, OURS, Settings
 
 __all__ = ["SHARED", "push", "write_card"]
 
@@ -64,11 +63,13 @@ Or evaluate it again: `hf download {repo} --local-dir RUN`, then `regil evaluate
 """
 
 _HOW = {
-    "td3bc": "ReGIL's guided warm-up, behaviour cloning on what succeeded, and TD3",
+    **dict.fromkeys(OURS, "ReGIL's guided warm-up, behaviour cloning on what succeeded, and TD3"),
     "bc": "behaviour cloning",
     "baku": "cloning of chunks of its actions",
     "rot": "behaviour cloning, and RL on transport rewards",
 }
+
+_HOMES = {"td3bc": "", "td3bc-background": ".background"}
 
 
 def write_card(run: Path, repo: str = "OWNER/NAME") -> Path:
@@ -126,7 +127,7 @@ def write_card(run: Path, repo: str = "OWNER/NAME") -> Path:
     }
     card = _CARD.format(
         algorithm=algorithm.__name__,
-        home="" if algorithm is TD3BC else ".baselines",
+        home=_HOMES.get(settings.algo, ".baselines"),
         how=_HOW[settings.algo] if guided else "TD3 on a reward that compares pictures with it",
         unit="updates" if issubclass(algorithm, Offline) else "agent steps",
         front=yaml.safe_dump(front, sort_keys=False),

@@ -17,11 +17,13 @@ from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper, make_e
 from regil_wrappers.encoders import runs_code
 from regil_wrappers.encoders.options import absolute
 
+from regil_sb3.background import BackgroundTD3BC
 from regil_sb3.baselines import BAKU, BC, ROT, ReverseForwardCurriculum
 from regil_sb3.files import replacing
 from regil_sb3.td3bc import TD3BC
 
-ALGOS: dict[str, type[TD3BC] | type[BAKU]] = {"td3bc": TD3BC, "bc": BC, "rot": ROT, "baku": BAKU}
+OURS: dict[str, type[TD3BC]] = {"td3bc": TD3BC, "td3bc-background": BackgroundTD3BC}
+ALGOS: dict[str, type[TD3BC] | type[BAKU]] = {**OURS, "bc": BC, "rot": ROT, "baku": BAKU}
 
 RETRIEVAL = {
     "regil_wrappers.RetrievalGuideWrapper": RetrievalGuideWrapper,
@@ -70,7 +72,8 @@ class Settings:
         n_envs: environments that step together.
         frame_stack: frames in an observation.
         policy: name of the policy.
-        eval_episodes: unseen episodes each time that the policy is evaluated during training.
+        eval_episodes: unseen episodes each time that the policy is evaluated during training; 0:
+            it is not, and there is no second environment to do so.
         eval_freq: agent steps between two evaluations; None: 2,500, or a sixth of a shorter run.
         hyperparams: arguments of the algorithm.
     """
@@ -252,6 +255,7 @@ def make_settings(
     seed: int = 0,
     steps: int | None = None,
     overrides: list[str] | None = None,
+    algo: str | None = None,
 ) -> Settings:
     """Take a preset, and put ``KEY=VALUE`` overrides on top.
 
@@ -267,19 +271,25 @@ def make_settings(
             ``Settings``. With a policy other than "CnnPolicy" no frames are stacked and none of the
             preset's ``policy_kwargs`` are taken, with "MultiInputPolicy" ``n_steps`` is 1, unless
             they are given, too. An encoder's file is kept with its path from the root.
+        algo: a name of ``ALGOS``; None takes the preset's. One that is not ours takes the preset of
+            its name, where none is given.
 
     Raises:
-        ValueError: an unknown preset or key.
+        ValueError: an unknown preset or key, or a preset of another algorithm.
     """
     sections, compared = presets(), comparisons()
     own = env if env in sections else "default"
-    preset = preset or own
+    preset = preset or (own if algo is None or algo in OURS else algo)
     if preset not in sections and preset not in compared:
         names = ", ".join([*sections, *compared])
         raise ValueError(f"preset {preset!r} is unknown: use one of {names}")
     changes = dict(compared.get(preset, {}))
     section = copy.deepcopy(sections[own if preset in compared else preset])
     settings = Settings(env, changes.pop("algo", "td3bc"), preset, seed)
+    if algo in OURS and settings.algo in OURS:
+        settings.algo = algo
+    elif algo not in (None, settings.algo):
+        raise ValueError(f"--algo {algo}: preset {preset!r} is of {settings.algo}, leave one out")
     known = inspect.signature(ALGOS[settings.algo]).parameters
     settings.steps = section.pop("n_timesteps", settings.steps)
     for name in _OWN[1:]:
@@ -287,7 +297,7 @@ def make_settings(
             setattr(settings, name, section.pop(name))
     settings.hyperparams = section
     settings.hyperparams.pop("demo", None)  # the run folder's own copy is used
-    if settings.algo != "td3bc":  # another algorithm takes what it shares with ours
+    if settings.algo not in OURS:  # another algorithm takes what it shares with ours
         settings.hyperparams = {k: v for k, v in settings.hyperparams.items() if k in known}
     settings.env_wrapper += changes.pop("env_wrapper", [])  # outside the others
     given = pairs(overrides or [])
@@ -311,8 +321,9 @@ def make_settings(
         value = getattr(settings, name)
         if name == "eval_freq" and value is None:
             continue
-        if type(value) is not int or value < 1:
-            raise ValueError(f"{name} is {value!r}: it must be a whole number of at least 1")
+        least = 0 if name == "eval_episodes" else 1
+        if type(value) is not int or value < least:
+            raise ValueError(f"{name} is {value!r}: it must be a whole number of at least {least}")
     for name in settings.hyperparams:
         if name not in known:
             what = ALGOS[settings.algo].__name__

@@ -11,8 +11,8 @@ from __future__ import annotations
 import json
 import sys
 import warnings
-from collections.abc import Collection, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Collection
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 from regil_sb3.baselines import BAKU, BC, Offline, vinn_act
 from regil_sb3.checkpoint import CheckpointCallback, ReplayableEpisode
+from regil_sb3.envs import exists_once
 from regil_sb3.evaluation import (
     EVALUATION_SEED,
     METHODS,
@@ -57,7 +58,7 @@ from regil_sb3.run_folder import (
     save_model,
     steps_learned,
 )
-from regil_sb3.settings import ALGOS, Settings
+from regil_sb3.settings import ALGOS, OURS, Settings
 from regil_sb3.td3bc import TD3BC
 from regil_sb3.watch import Watch
 
@@ -80,9 +81,10 @@ def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEn
     wrappers = settings.wrappers(str(demo))
 
     def wrap(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+        once = exists_once(env)
         for wrapper, arguments in wrappers:
             env = wrapper(env, **arguments)
-        return ReplayableEpisode(env)
+        return env if once else ReplayableEpisode(env)
 
     try:
         env: VecEnv = make_vec_env(
@@ -111,9 +113,12 @@ class TrainingCallback(BaseCallback):
     The policy is evaluated for the first time when the warm-up has ended and its BC updates are
     done, then every ``every`` steps. ``model.zip`` is the last, ``best_model.zip`` the best on the
     selection seeds; each replaces the old file at once, so that a failed save loses nothing.
+    Without an environment to evaluate in there is no best.
     """
 
-    def __init__(self, run: Path, env: VecEnv, every: int, episodes: int, watch: Watch) -> None:
+    def __init__(
+        self, run: Path, env: VecEnv | None, every: int, episodes: int, watch: Watch
+    ) -> None:
         super().__init__()
         self.run, self.watch = run, watch
         self.eval_env = env
@@ -122,9 +127,9 @@ class TrainingCallback(BaseCallback):
         self._next = every
         self._first = True
         self._bar = tqdm(unit="step", dynamic_ncols=True)
-        self._repeat = action_repeat(env)
 
     def _on_training_start(self) -> None:
+        self._repeat = action_repeat(self.training_env)
         self._next = (self.num_timesteps // self.every + 1) * self.every
         self._first = self.best < 0
         self._bar.reset(self._learner._total_timesteps)
@@ -171,6 +176,10 @@ class TrainingCallback(BaseCallback):
         )
 
     def _evaluate(self) -> None:
+        if self.eval_env is None:
+            self._learner.dump_logs()
+            save_model(self._learner, self.run / "model.zip")
+            return
         self._bar.set_description_str("evaluating")
         result = evaluate(policy_act(self.model), self.eval_env, self.episodes, SELECTION_SEED)
         success = float(np.mean(result.successes))
@@ -190,30 +199,25 @@ class TrainingCallback(BaseCallback):
         self._bar.close()
 
 
-@contextmanager
-def _environments(settings: Settings, demo: Path) -> Iterator[tuple[VecEnv, VecEnv]]:
-    env = make_env(settings, demo)
-    try:
-        eval_env = make_env(settings, demo, n_envs=1)
-        try:
-            yield env, eval_env
-        finally:
-            eval_env.close()
-    finally:
-        env.close()
+def _to_evaluate_in(settings: Settings, demo: Path) -> AbstractContextManager[VecEnv | None]:
+    """A second environment, for the policy as it learns; none where it is not to be evaluated."""
+    if not settings.eval_episodes:
+        return nullcontext()
+    return closing(make_env(settings, demo, n_envs=1))
 
 
 def train(settings: Settings, demo: Demonstration, run: Path) -> None:
     """Learn, and leave a run folder with config, demonstration, logs and models.
 
-    From a demonstration without actions `TD3BC` learns by the reward alone, and a line says so.
+    From a demonstration without actions `TD3BC` learns by the reward alone, and where there is no
+    second environment the policy is not evaluated as it learns; a line says so.
 
     Raises:
         ValueError: the folder holds a run already, or the settings do not fit.
         KeyboardInterrupt: passed on after everything is saved.
     """
     refuse_finished(run)
-    if demo.actions is None and settings.algo == "td3bc":
+    if demo.actions is None and settings.algo in OURS:
         settings = settings.without_guide()
         print(
             "the demonstration has no actions: no guide, no warm-up and no behaviour cloning, "
@@ -223,24 +227,31 @@ def train(settings: Settings, demo: Demonstration, run: Path) -> None:
     run.mkdir(parents=True, exist_ok=True)
     with locked(run):
         demo.save(run / "demo.hdf5")
-        with _environments(settings, run / "demo.hdf5") as (env, eval_env):
-            model = _new_model(settings, demo, env)
-            if isinstance(model, TD3BC) and settings.steps <= model.warmup_steps:
-                raise ValueError(
-                    f"{settings.steps} steps end before the warm-up of {model.warmup_steps} does: "
-                    "take more --steps, or a smaller --set warmup_steps=N"
+        with closing(make_env(settings, run / "demo.hdf5")) as env:
+            if settings.eval_episodes and exists_once(env.get_attr("unwrapped")[0]):
+                settings = replace(settings, eval_episodes=0)
+                print(
+                    f"{settings.env} exists once: the policy is evaluated when all is learned",
+                    file=sys.stderr,
                 )
-            env.reset()  # where the retrieval wrappers compare first frames
-            settings.save(
-                run / "config.yaml",
-                encoder=settings.retrieval("encoder"),
-                k=settings.retrieval("k"),
-                horizon=settings.retrieval("horizon"),
-                action_repeat=action_repeat(env),
-                demo_actions=None if demo.actions is None else len(demo.actions),
-                defaults=settings.defaults(),
-            )
-            _learn(model, settings, run, eval_env)
+            with _to_evaluate_in(settings, run / "demo.hdf5") as eval_env:
+                model = _new_model(settings, demo, env)
+                if isinstance(model, TD3BC) and settings.steps <= model.warmup_steps:
+                    raise ValueError(
+                        f"{settings.steps} steps end before the warm-up of {model.warmup_steps} "
+                        "does: take more --steps, or a smaller --set warmup_steps=N"
+                    )
+                env.reset()  # where the retrieval wrappers compare first frames
+                settings.save(
+                    run / "config.yaml",
+                    encoder=settings.retrieval("encoder"),
+                    k=settings.retrieval("k"),
+                    horizon=settings.retrieval("horizon"),
+                    action_repeat=action_repeat(env),
+                    demo_actions=None if demo.actions is None else len(demo.actions),
+                    defaults=settings.defaults(),
+                )
+                _learn(model, settings, run, eval_env)
 
 
 def has_learned(run: Path, settings: Settings) -> bool:
@@ -269,7 +280,10 @@ def resume(run: Path) -> Settings:
                 f"{run} has learned all its steps: start a new run, or use `regil evaluate` on "
                 "this one"
             )
-        with _environments(settings, run / "demo.hdf5") as (env, eval_env):
+        with (
+            closing(make_env(settings, run / "demo.hdf5")) as env,
+            _to_evaluate_in(settings, run / "demo.hdf5") as eval_env,
+        ):
             if offline and (run / "model.zip").exists():
                 model = ALGOS[settings.algo].load(run / "model.zip", env=env, demo=demo)
             else:
@@ -279,7 +293,7 @@ def resume(run: Path) -> Settings:
     return settings
 
 
-def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv) -> None:
+def _learn(model: Learner, settings: Settings, run: Path, eval_env: VecEnv | None) -> None:
     log = run / "progress.csv"
     checkpoints = None
     if isinstance(model, TD3BC) and not isinstance(model, Offline):
@@ -408,44 +422,46 @@ def evaluate_run(
         raise ValueError(f"{run} has no model.zip yet: train it first")
     refuse_unwritable(run)
     demo = Demonstration.load(run / "demo.hdf5")
-    with (
-        closing(make_env(settings, run / "demo.hdf5", n_envs=1)) as env,
-        closing(make_env(settings.plain(), run / "demo.hdf5", n_envs=1)) as plain_env,
-    ):
+    results: dict[str, Any] = {}
+    filmed: Evaluation | None = None
+
+    def play(name: str, act: Act, env: VecEnv) -> None:
+        nonlocal filmed
+        if name not in only:
+            return
+        with tqdm(total=episodes, desc=f"evaluating {name}", dynamic_ncols=True) as bar:
+
+            def show(result: Evaluation) -> None:
+                bar.set_postfix_str(f"success {np.mean(result.successes):.2f}", refresh=False)
+                bar.update(1)
+
+            result = evaluate(act, env, episodes, EVALUATION_SEED, show)
+        results[name] = result.as_dict()
+        if name == "policy":
+            filmed = result
+
+    # One after the other: of a robot there are not two
+    with closing(make_env(settings, run / "demo.hdf5", n_envs=1)) as env:
         algorithm = ALGOS[settings.algo]
         model = algorithm.load(run / "model.zip", trust=trust, buffer_size=1)
         offline = isinstance(model, Offline)
-        results: dict[str, Any] = {
-            "steps": model.num_timesteps,
-            "frames": 0 if offline else model.num_timesteps * action_repeat(env),
-        }
-        acts: list[tuple[str, Act, VecEnv]] = [("policy", policy_act(model), env)]
+        results["steps"] = model.num_timesteps
+        results["frames"] = 0 if offline else model.num_timesteps * action_repeat(env)
+        play("policy", policy_act(model), env)
         if (run / "best_model.zip").exists():
             best = algorithm.load(run / "best_model.zip", trust=trust, buffer_size=1)
-            acts.append(("best_policy", policy_act(best), env))
-        if plain_env.has_attr("guide_action"):
-            acts.append(("guide", guide_act, plain_env))
+            play("best_policy", policy_act(best), env)
         if load_calibration(env, run / "calibration.json"):
-            acts.append(("corrected_guide", guide_act, env))
-        if offline and "vinn" in only and plain_env.has_attr("retriever"):
-            acts.append(("vinn", vinn_act(demo, settings.retrieval("k")), plain_env))
+            play("corrected_guide", guide_act, env)
         if not offline and "bc" in only and demo.actions is not None:
-            acts.append(("bc", policy_act(_bc_model(settings, demo, env, run, trust)), env))
-        acts = [act for act in acts if act[0] in only]
-        filmed: Evaluation | None = None
-        for name, act, where in acts:
-            with tqdm(total=episodes, desc=f"evaluating {name}", dynamic_ncols=True) as bar:
-
-                def show(result: Evaluation, bar: Any = bar) -> None:
-                    bar.set_postfix_str(f"success {np.mean(result.successes):.2f}", refresh=False)
-                    bar.update(1)
-
-                result = evaluate(act, where, episodes, EVALUATION_SEED, show)
-            results[name] = result.as_dict()
-            if name == "policy":
-                filmed = result
-        results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
-        results["asked"] = [name for name in METHODS if name in only]
+            play("bc", policy_act(_bc_model(settings, demo, env, run, trust)), env)
+    with closing(make_env(settings.plain(), run / "demo.hdf5", n_envs=1)) as env:
+        if env.has_attr("guide_action"):
+            play("guide", guide_act, env)
+        if offline and env.has_attr("retriever"):
+            play("vinn", vinn_act(demo, settings.retrieval("k")), env)
+    results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
+    results["asked"] = [name for name in METHODS if name in only]
     try:
         with replacing(run / "evaluation.json") as file:
             file.write(json.dumps(results, indent=1).encode())

@@ -137,11 +137,15 @@ def _memory(learning: _Learning, settings: Settings) -> Finding:
         parts.append(f"replay buffer {filled / 1e9:.2f}{later}")
     if learning.kept:
         parts.append(f"success buffer up to {learning.kept / 1e9:.2f}")
-    n = settings.n_envs
+    more = settings.n_envs - (not settings.eval_episodes)
+    left_out = (
+        f"; not counted: {more} more environment{'s' * (more > 1)}, as training has {more + 1}"
+        if more
+        else ""
+    )
     line = (
         f"{(process + filled + learning.kept) / 1e9:.2f} GB after {settings.steps:,} steps: "
-        f"{', '.join(parts)}; {free / 1e9:.1f} GB are free; not counted: "
-        f"{n} more environment{'s' * (n > 1)}, as training has {n + 1}"
+        f"{', '.join(parts)}; {free / 1e9:.1f} GB are free{left_out}"
     )
     if learning.kept > 0.8 * free:
         most = max(int(0.5 * _setting(settings, "success_buffer_size") * free / learning.kept), 1)
@@ -170,14 +174,16 @@ def _time(
     if learning.firsts:
         each = f"{1000 * learning.first:.1f} ms each ({_minutes(first)})"
         parts.append(f"{learning.firsts:,} updates by behaviour cloning before, {each}")
-    parts.append(
-        f"{episodes} episodes that the policy is evaluated in, up to {longest} steps each (up to "
-        f"{_minutes(judged)})"
-    )
+    if episodes:
+        parts.append(
+            f"{episodes} episodes that the policy is evaluated in, up to {longest} steps each (up "
+            f"to {_minutes(judged)})"
+        )
     least = played + learned + first
     left = ", ".join([*left_out, "the evaluation after it"])
+    most = f" to {_minutes(least + judged)}" if episodes else ""
     line = (
-        f"{settings.steps:,} steps take {_minutes(least)} to {_minutes(least + judged)}: "
+        f"{settings.steps:,} steps take {_minutes(least)}{most}: "
         f"{', '.join(parts)}; not counted: {left}"
     )
     if learning.share < _BUSY:

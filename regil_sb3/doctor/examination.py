@@ -11,6 +11,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ from regil_sb3.doctor.pictures import (
 )
 from regil_sb3.doctor.rewards import Reward, check_reward, judged, played_demonstration, signals
 from regil_sb3.doctor.search import Filmed, candidates, search
+from regil_sb3.envs import exists_once
 from regil_sb3.evaluation import SELECTION_SEED
 from regil_sb3.process import keep_freed_memory
 from regil_sb3.settings import RETRIEVAL, Settings, make_settings
@@ -105,6 +107,8 @@ def examine(
     demo = demo if isinstance(demo, Demonstration) else Demonstration.load(demo)
     say = progress or (lambda line: None)
     env = _bare(settings)
+    if exists_once(env):
+        settings = replace(settings, eval_episodes=0)  # as training does
     try:
         say("comparing pictures and actions")
         found, embedded = _seen(env, demo, settings)

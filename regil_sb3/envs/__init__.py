@@ -4,6 +4,10 @@ Gymnasium from 1.0 on reads no entry points: whoever wants the ids imports the p
 imports a simulator, torch or stable-baselines3.
 """
 
+from __future__ import annotations
+
+from typing import Any
+
 from regil_sb3.envs.libero_tasks import LIBERO_TASKS
 
 __all__ = [
@@ -13,6 +17,7 @@ __all__ = [
     "REHEARSAL_TASKS",
     "ROBOSUITE_ROBOTS",
     "ROBOSUITE_TASKS",
+    "exists_once",
     "register_envs",
 ]
 
@@ -103,6 +108,14 @@ ROBOSUITE_ROBOTS = {
     "ur5e": "UR5e",
 }
 """robosuite's arms, by the names they have in ids."""
+
+
+def exists_once(env: Any) -> bool:
+    """Whether a Gymnasium environment says that it is a robot (``metadata["regil"]``).
+
+    There is no second one, and what was done with it is not done again.
+    """
+    return bool((env.unwrapped.metadata.get("regil") or {}).get("exists_once", False))
 
 
 def register_envs() -> None:

@@ -115,6 +115,7 @@ class RehearsalEnv(RobotEnv, EzPickle):
         except BaseException:
             self.robot.close()
             raise
+        self.metadata["regil"]["exists_once"] = False  # each has a robot of its own
         # As the camera sees them, targets move to the left and to the right alone
         span = (self._task.span[1] - self._task.span[0]) / 2 / self.limits.delta
         self.metadata["regil"]["plane"] = [span, 0.1 * span, 0.2]

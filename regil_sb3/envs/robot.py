@@ -162,6 +162,7 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
             "render_fps": round(rate),
             "regil": {
                 "camera": getattr(camera, "name", type(camera).__name__),
+                "exists_once": True,
                 "image_size": [size, size],
                 "action_repeat": 1,
                 "control_rate": rate,

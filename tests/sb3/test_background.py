@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import csv
+import json
+import signal
 import threading
 import time
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import toy_env
@@ -12,10 +16,13 @@ from at_step import At
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
-from regil_sb3 import TD3BC
+from regil_sb3 import TD3BC, training
 from regil_sb3.background import BackgroundTD3BC
 from regil_sb3.checkpoint import CheckpointCallback, ReplayableEpisode, callback
 from regil_sb3.checkpoint.learner_state import learner_state
+from regil_sb3.cli import main
+from regil_sb3.evaluation import METHODS
+from regil_sb3.settings import Settings
 
 
 def made(demo, pauses=None, replayable=False, **arguments):
@@ -160,3 +167,80 @@ def test_a_failure_of_the_learner_ends_learning(demo, monkeypatch):
     monkeypatch.setattr(TD3BC, "_require_finite", broken)
     with pytest.raises(FloatingPointError, match="critic loss is nan"):
         made(demo).learn(5_000)
+
+
+class StoppedError(Exception):
+    """Before the evaluation."""
+
+
+class Robot(toy_env.ToyReach):
+    """There is one camera and one arm."""
+
+    open_ones = 0
+    steps_of_all = 0
+
+    def __init__(self, **settings):
+        if Robot.open_ones:
+            raise RuntimeError("the camera is in use")
+        super().__init__(**settings)
+        Robot.open_ones += 1
+        self.metadata["regil"]["exists_once"] = True
+
+    def step(self, action):
+        Robot.steps_of_all += 1
+        return super().step(action)
+
+    def close(self):
+        Robot.open_ones -= 1
+
+
+@pytest.fixture
+def robot(words, monkeypatch):
+    """Words of a `regil train` on it."""
+    monkeypatch.setattr(Robot, "open_ones", 0)
+    monkeypatch.setattr(training, "BC_UPDATES", 3)
+    gym.register("OneRobot-v0", Robot)
+    yield [*(word.replace("ToyReach", "OneRobot") for word in words), "--algo", "td3bc-background"]
+    assert Robot.open_ones == 0
+    del gym.registry["OneRobot-v0"]
+
+
+def test_a_robot_is_opened_once_at_a_time(robot, tmp_path, capsys):
+    run = tmp_path / "run"
+    assert main(robot) == 0
+    said = capsys.readouterr()
+    assert "OneRobot-v0 exists once: the policy is evaluated when all is learned" in said.err
+    settings = Settings.load(run / "config.yaml")
+    assert (settings.algo, settings.eval_episodes) == ("td3bc-background", 0)
+    assert not (run / "best_model.zip").exists()
+    found = json.loads((run / "evaluation.json").read_text())
+    assert {"policy", "guide", "bc"} == found.keys() & METHODS.keys()
+    assert found["steps"] == 200
+    with (run / "progress.csv").open(newline="") as file:
+        logged = list(csv.DictReader(file))
+    assert {"train/updates_owed", "time/guided"} <= logged[-1].keys()
+    assert "eval/success_rate" not in logged[-1]
+    assert "from regil_sb3.background import BackgroundTD3BC\n" in (run / "README.md").read_text()
+    assert main(["report", str(run)]) == 0
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 0
+
+
+def test_a_robot_does_nothing_again_when_a_run_goes_on(robot, tmp_path, monkeypatch, capsys):
+    """Its open episode is ended, not repeated."""
+    step = training.TrainingCallback._on_step
+
+    def on_step(self):
+        if self.num_timesteps == 130:
+            signal.raise_signal(signal.SIGTERM)
+        return step(self)
+
+    monkeypatch.setattr(training.TrainingCallback, "_on_step", on_step)
+    with pytest.raises(SystemExit):
+        main(robot)
+    monkeypatch.setattr(training.TrainingCallback, "_on_step", step)
+    monkeypatch.setattr(Robot, "steps_of_all", 0)
+    monkeypatch.setattr(training, "evaluate_run", lambda *_: (_ for _ in ()).throw(StoppedError))
+    capsys.readouterr()
+    with pytest.raises(StoppedError), pytest.warns(UserWarning, match="ended as truncated"):
+        main(["train", "--resume", str(tmp_path / "run")])
+    assert Robot.steps_of_all == 200 - 130

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from contextlib import closing
 from dataclasses import replace
@@ -394,6 +395,15 @@ def test_the_papers_ablations():
     assert {n for n, h in made.items() if h.get("bc_coef", 2.0) == 0} == {"reg-rl", "rl"}
     assert {n for n, h in made.items() if h.get("q_coef", 1.0) == 0} == {"reg-bc"}
     assert not made["bc-rl"]["keep_own_successes"]  # the demonstration alone
+
+
+def test_our_presets_are_for_updates_beside_control_too():
+    settings = make_settings(ENV, "quick", algo="td3bc-background")
+    assert settings == dataclasses.replace(make_settings(ENV, "quick"), algo="td3bc-background")
+    assert make_settings(ENV, "tot", algo="rot") == make_settings(ENV, "tot")
+    for algo in ("td3bc", "td3bc-background"):
+        with pytest.raises(ValueError, match=f"--algo {algo}: preset 'tot' is of rot"):
+            make_settings(ENV, "tot", algo=algo)
 
 
 def test_algo_and_preset_must_agree(capsys):

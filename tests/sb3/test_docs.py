@@ -154,7 +154,7 @@ NOT_RUN = {
     r"python docs/": "measures or draws for minutes to hours; that the script is there is tested",
     r"regil push ": "uploads: test_model_card.py has a stand-in for the hub",
     r"regil convert IN OUT ": "a synopsis; test_convert.py",
-    r"regil record ENV --teleop": "needs a window and a hand: test_teleoperation.py",
+    r"regil record \S+ --teleop": "needs a window and a hand: test_teleoperation.py",
     r"regil train --preset paper ": "needs DINOv3's weights, a download: test_paper.py",
     r"regil bench ranking": "no option makes it short: test_bench_ranking.py",
     r"regil bench faults --kills": "kills a run again and again: test_bench_faults.py",
@@ -205,6 +205,18 @@ ZOO_ALSO = {
     "record_video": ["-n", "10"],
     "plot": ["-w", "1"],
 }
+# Of docs/robot.md, in place of hardware: a simulated robot, and one alone
+MY_ROBOT = """
+import gymnasium
+from regil_sb3.envs.rehearsal import RehearsalEnv
+
+def make(**ignored):
+    env = RehearsalEnv("reach", max_steps=60)
+    env.metadata["regil"]["exists_once"] = True
+    return env
+
+gymnasium.register("my/reach-v0", make)
+"""
 STEPS = 12  # of an episode
 STEPS_OF_DOCTOR = 50  # a guided success takes about 40
 # What a page's words in capitals stand for
@@ -220,7 +232,7 @@ def smaller(words: list[str]) -> list[str]:
     """A `regil` command's words with more behind them, so that it takes seconds."""
     args = _parser().parse_args(words)
     if args.command == "train" and args.resume is None:
-        settings = make_settings(args.env, args.preset or args.algo, overrides=args.set)
+        settings = make_settings(args.env, args.preset, overrides=args.set, algo=args.algo)
         known = {*inspect.signature(ALGOS[settings.algo]).parameters, "eval_episodes"}
         sets = [f"--set={name}={value}" for name, value in TRAIN.items() if name in known]
         own = [] if args.out else ["--out", f"runs/{len(list(Path('runs').iterdir()))}"]
@@ -319,6 +331,10 @@ def test_every_command_runs_in_order(page, recorded, trained, monkeypatch, reque
     if "my_envs" in PAGES[page]:
         Path("my_envs.py").write_text(PYTHON.findall(PAGES[page])[0][1])
         monkeypatch.syspath_prepend(Path.cwd())
+    if "my_robot:" in PAGES[page]:
+        Path("my_robot.py").write_text(MY_ROBOT)
+        monkeypatch.syspath_prepend(Path.cwd())
+        recording.record_expert("my_robot:my/reach-v0").save("reach.hdf5")
     if "runs/stopped" in STAND_FOR.get(page, {}).values():
         with pytest.MonkeyPatch.context() as patch:
             interrupted(patch)

@@ -114,6 +114,13 @@ def test_several_environments(demo):
     assert gigabytes(found, "replay buffer") == pytest.approx(15_000 * FRAME / 1e9, rel=0.05)
 
 
+def test_a_robot_is_evaluated_when_all_is_learned(demo):
+    found = checked(demo, ["eval_episodes=0"])
+    assert "evaluated in" not in found["time"].line
+    assert re.match(r"15,000 steps take \S+ min: ", found["time"].line)
+    assert "more environment" not in found["memory"].line
+
+
 def test_a_policy_without_camera(demo):
     found = checked(demo, STATE)
     assert found["time"].verdict == "ok"
