@@ -2,6 +2,7 @@
 
 * ``BackgroundTD3BC`` - collects in the calling thread, learns in another
 * ``paused`` - an environment that holds still meanwhile
+* ``at_rest`` - a model that does not change meanwhile
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import queue
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from regil_sb3.td3bc import TD3BC
 
-__all__ = ["BackgroundTD3BC", "paused"]
+__all__ = ["BackgroundTD3BC", "at_rest", "paused"]
 
 SelfBackground = TypeVar("SelfBackground", bound="BackgroundTD3BC")
 
@@ -256,6 +257,11 @@ class BackgroundTD3BC(TD3BC):
     def _excluded_save_params(self) -> list[str]:
         ours = ("_acting", "_learner", "_own_logger", "_inbox", "_turn", "_copies", "_failure")
         return [*super()._excluded_save_params(), *ours, "_owed"]
+
+
+def at_rest(model: Any) -> AbstractContextManager[None]:
+    """A model does not learn meanwhile, whichever it is: `BackgroundTD3BC.held`."""
+    return model.held() if isinstance(model, BackgroundTD3BC) else contextlib.nullcontext()
 
 
 class _Inbox:

@@ -27,6 +27,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 from tqdm import tqdm
 
+from regil_sb3.background import at_rest
 from regil_sb3.baselines import BAKU, BC, Offline, vinn_act
 from regil_sb3.checkpoint import CheckpointCallback, ReplayableEpisode
 from regil_sb3.envs import exists_once
@@ -144,7 +145,8 @@ class TrainingCallback(BaseCallback):
         refuse_removed(self.run, self.num_timesteps)
         if self._first and getattr(self.model, "pretrained", False):
             save_calibration(self.training_env, self.run / "calibration.json")
-            self._evaluate()
+            with at_rest(self.model):
+                self._evaluate()
             self._first = False
 
     def _on_step(self) -> bool:
@@ -157,10 +159,11 @@ class TrainingCallback(BaseCallback):
             self.logger.record("time/frames", self.num_timesteps * self._repeat)
         if self.num_timesteps >= self._next:
             save_calibration(self.training_env, self.run / "calibration.json")
-            if online is None or not online.in_warmup:
-                self._evaluate()
-            else:
-                save_model(model, self.run / "model.zip")
+            with at_rest(model):
+                if online is None or not online.in_warmup:
+                    self._evaluate()
+                else:
+                    save_model(model, self.run / "model.zip")
             self._next += self.every
         return True
 

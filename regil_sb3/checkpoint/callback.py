@@ -9,7 +9,6 @@ A checkpoint executes nothing when it is read: it is JSON and arrays
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import threading
@@ -25,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
 from regil_sb3 import __version__
-from regil_sb3.background import BackgroundTD3BC
+from regil_sb3.background import at_rest
 from regil_sb3.checkpoint.generations import Generations
 from regil_sb3.checkpoint.learner_state import check_can_be_kept, learner_state, load_learner_state
 from regil_sb3.td3bc import TD3BC
@@ -168,7 +167,7 @@ class CheckpointCallback(BaseCallback):
         """
         model = self.model
         assert isinstance(model, TD3BC)
-        with model.held() if isinstance(model, BackgroundTD3BC) else contextlib.nullcontext():
+        with at_rest(model):
             self._save(model)
 
     def _save(self, model: TD3BC) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import toy_env
 from at_step import At
-from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper
+from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from regil_sb3 import TD3BC, training
@@ -22,7 +22,7 @@ from regil_sb3.checkpoint import CheckpointCallback, ReplayableEpisode, callback
 from regil_sb3.checkpoint.learner_state import learner_state
 from regil_sb3.cli import main
 from regil_sb3.evaluation import METHODS
-from regil_sb3.settings import Settings
+from regil_sb3.settings import Settings, make_settings
 
 
 def made(demo, pauses=None, replayable=False, **arguments):
@@ -244,3 +244,24 @@ def test_a_robot_does_nothing_again_when_a_run_goes_on(robot, tmp_path, monkeypa
     with pytest.raises(StoppedError), pytest.warns(UserWarning, match="ended as truncated"):
         main(["train", "--resume", str(tmp_path / "run")])
     assert Robot.steps_of_all == 200 - 130
+
+
+def test_a_robot_is_paused_while_the_policy_is_evaluated_in_another(words, tmp_path, monkeypatch):
+    told, meanwhile = [], []
+    evaluate = training.evaluate
+
+    def evaluated(*arguments):
+        meanwhile.append(told[-1])
+        return evaluate(*arguments)
+
+    for name in ("pause", "resume"):
+        monkeypatch.setattr(
+            toy_env.ToyReach, name, lambda self, name=name: told.append(name), raising=False
+        )
+    monkeypatch.setattr(training, "evaluate", evaluated)
+    settings = [word for word in words[words.index("--set") :] if word != "--set"]
+    made = make_settings("ToyReach-v0", None, 0, 120, settings, "td3bc-background")
+    training.train(made, Demonstration.load(tmp_path / "reach.hdf5"), tmp_path / "run")
+    assert meanwhile == ["pause"] * len(meanwhile)
+    assert len(meanwhile) > 2
+    assert told[-1] == "resume"
