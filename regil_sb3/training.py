@@ -82,10 +82,9 @@ def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEn
     wrappers = settings.wrappers(str(demo))
 
     def wrap(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-        once = exists_once(env)
         for wrapper, arguments in wrappers:
             env = wrapper(env, **arguments)
-        return env if once else ReplayableEpisode(env)
+        return env if exists_once(env) else ReplayableEpisode(env)
 
     try:
         env: VecEnv = make_vec_env(
@@ -144,9 +143,7 @@ class TrainingCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         refuse_removed(self.run, self.num_timesteps)
         if self._first and getattr(self.model, "pretrained", False):
-            save_calibration(self.training_env, self.run / "calibration.json")
-            with at_rest(self.model):
-                self._evaluate()
+            self._keep(self.eval_env)
             self._first = False
 
     def _on_step(self) -> bool:
@@ -158,12 +155,7 @@ class TrainingCallback(BaseCallback):
                 self._describe(online)
             self.logger.record("time/frames", self.num_timesteps * self._repeat)
         if self.num_timesteps >= self._next:
-            save_calibration(self.training_env, self.run / "calibration.json")
-            with at_rest(model):
-                if online is None or not online.in_warmup:
-                    self._evaluate()
-                else:
-                    save_model(model, self.run / "model.zip")
+            self._keep(None if online is not None and online.in_warmup else self.eval_env)
             self._next += self.every
         return True
 
@@ -178,13 +170,18 @@ class TrainingCallback(BaseCallback):
             f"success {success}{best}, {model.success_buffer.episodes} episodes kept{warned}"
         )
 
-    def _evaluate(self) -> None:
-        if self.eval_env is None:
-            self._learner.dump_logs()
-            save_model(self._learner, self.run / "model.zip")
-            return
+    def _keep(self, eval_env: VecEnv | None) -> None:
+        """Save what is learned, once it is evaluated where there is an environment for it."""
+        save_calibration(self.training_env, self.run / "calibration.json")
+        with at_rest(self.model):
+            if eval_env is None:
+                save_model(self._learner, self.run / "model.zip")
+            else:
+                self._evaluate(eval_env)
+
+    def _evaluate(self, env: VecEnv) -> None:
         self._bar.set_description_str("evaluating")
-        result = evaluate(policy_act(self.model), self.eval_env, self.episodes, SELECTION_SEED)
+        result = evaluate(policy_act(self.model), env, self.episodes, SELECTION_SEED)
         success = float(np.mean(result.successes))
         self.logger.record("eval/success_rate", success)
         self.logger.record("eval/retrieval_reward", float(np.mean(result.returns)))
@@ -458,11 +455,12 @@ def evaluate_run(
             play("corrected_guide", guide_act, env)
         if not offline and "bc" in only and demo.actions is not None:
             play("bc", policy_act(_bc_model(settings, demo, env, run, trust)), env)
-    with closing(make_env(settings.plain(), run / "demo.hdf5", n_envs=1)) as env:
-        if env.has_attr("guide_action"):
-            play("guide", guide_act, env)
-        if offline and env.has_attr("retriever"):
-            play("vinn", vinn_act(demo, settings.retrieval("k")), env)
+    if not {"guide", "vinn"}.isdisjoint(only):
+        with closing(make_env(settings.plain(), run / "demo.hdf5", n_envs=1)) as env:
+            if env.has_attr("guide_action"):
+                play("guide", guide_act, env)
+            if offline and env.has_attr("retriever"):
+                play("vinn", vinn_act(demo, settings.retrieval("k")), env)
     results["seeds"] = list(range(EVALUATION_SEED, EVALUATION_SEED + episodes))
     results["asked"] = [name for name in METHODS if name in only]
     try:

@@ -137,12 +137,9 @@ def _memory(learning: _Learning, settings: Settings) -> Finding:
         parts.append(f"replay buffer {filled / 1e9:.2f}{later}")
     if learning.kept:
         parts.append(f"success buffer up to {learning.kept / 1e9:.2f}")
-    more = settings.n_envs - (not settings.eval_episodes)
-    left_out = (
-        f"; not counted: {more} more environment{'s' * (more > 1)}, as training has {more + 1}"
-        if more
-        else ""
-    )
+    envs = settings.n_envs + bool(settings.eval_episodes)
+    more = f"{envs - 1} more environment{'s' * (envs > 2)}, as training has {envs}"
+    left_out = f"; not counted: {more}" if envs > 1 else ""
     line = (
         f"{(process + filled + learning.kept) / 1e9:.2f} GB after {settings.steps:,} steps: "
         f"{', '.join(parts)}; {free / 1e9:.1f} GB are free{left_out}"

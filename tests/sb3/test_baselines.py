@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from contextlib import closing
 from dataclasses import replace
@@ -399,7 +398,7 @@ def test_the_papers_ablations():
 
 def test_our_presets_are_for_updates_beside_control_too():
     settings = make_settings(ENV, "quick", algo="td3bc-background")
-    assert settings == dataclasses.replace(make_settings(ENV, "quick"), algo="td3bc-background")
+    assert settings == replace(make_settings(ENV, "quick"), algo="td3bc-background")
     assert make_settings(ENV, "tot", algo="rot") == make_settings(ENV, "tot")
     for algo in ("td3bc", "td3bc-background"):
         with pytest.raises(ValueError, match=f"--algo {algo}: preset 'tot' is of rot"):
