@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from regil_wrappers.demonstration import Demonstration
+from regil_wrappers.frames import stated
 
 from regil_sb3.envs import EVALUATION_SEEDS
 
@@ -151,7 +152,7 @@ class Recorder:
         draws = hasattr(self._ours, "encoder_frame")
         if encoder_frame_size is not None and not draws:
             raise ValueError(f"{name} draws no larger pictures (no encoder_frame())")
-        ours = self._ours.metadata.get("regil") or {}
+        ours = stated(self._ours.metadata)
         if draws and not (self._pixels or self._keys or "image_size" in ours):
             raise ValueError(
                 f"{name} draws its pictures (encoder_frame) but does not say in which size: "
@@ -230,7 +231,7 @@ class Recorder:
             } or None
         elif observations is not None:
             observations = np.stack(observations)
-        ours = self.env.unwrapped.metadata.get("regil", {})
+        ours = stated(self.env.unwrapped.metadata)
         kept = ("camera", "render", "image_size", "action_repeat", "control_rate")
         return Demonstration(
             frames=np.stack(self.frames),

@@ -21,6 +21,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from regil_wrappers import Demonstration
+from regil_wrappers.frames import stated
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
@@ -84,7 +85,12 @@ def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEn
     def wrap(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
         for wrapper, arguments in wrappers:
             env = wrapper(env, **arguments)
-        return env if exists_once(env) else ReplayableEpisode(env)
+        if not exists_once(env):
+            return ReplayableEpisode(env)
+        if (n_envs or settings.n_envs) > 1:
+            env.close()
+            raise ValueError(f"{settings.env} exists once: n_envs is {settings.n_envs}, take 1")
+        return env
 
     try:
         env: VecEnv = make_vec_env(
@@ -103,8 +109,7 @@ def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEn
 
 def action_repeat(env: VecEnv) -> int:
     """Frames that pass in one agent step, as far as the environment says."""
-    own = env.get_attr("metadata")[0].get("regil", {})
-    return int(own.get("action_repeat", 1))
+    return int(stated(env.get_attr("metadata")[0]).get("action_repeat", 1))
 
 
 class TrainingCallback(BaseCallback):

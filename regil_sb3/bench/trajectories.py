@@ -11,7 +11,7 @@ again.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration
+from regil_wrappers.frames import stated
 from scipy.spatial.distance import cdist  # type: ignore[import-untyped]
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
@@ -93,7 +94,7 @@ class _Hands:
     """
 
     def __init__(self, env: VecEnv) -> None:
-        facts: Mapping[str, Any] = env.get_attr("metadata")[0].get("regil", {})
+        facts = stated(env.get_attr("metadata")[0])
         self.env = env
         self.simulated = env.has_attr("hand_position")
         if not self.simulated and "translation_dims" not in facts:

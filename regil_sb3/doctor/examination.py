@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper
 from regil_wrappers.encoders import embed
-from regil_wrappers.frames import FrameSource
+from regil_wrappers.frames import FrameSource, stated
 from regil_wrappers.retrieval_wrapper import make_retriever, settings_of
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
@@ -44,7 +44,6 @@ from regil_sb3.doctor.pictures import (
     check_pictures,
     check_recorded,
     check_scene,
-    said_of,
 )
 from regil_sb3.doctor.rewards import Reward, check_reward, judged, played_demonstration, signals
 from regil_sb3.doctor.search import Filmed, candidates, search
@@ -187,7 +186,7 @@ def _observations(env: Env, demo: Demonstration, n_stack: int) -> list[Finding]:
 
 def _gripper(env: Env) -> int | None:
     """Which dimension of an action moves the gripper, as far as the environment says."""
-    dim = said_of(env).get("gripper_dim")
+    dim = stated(env.unwrapped.metadata).get("gripper_dim")
     return dim if isinstance(dim, int) else None
 
 

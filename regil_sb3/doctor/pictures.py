@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration
 from regil_wrappers.alignment import squared_distances
-from regil_wrappers.frames import AS_RECORDED, FrameSource, check_recorded_settings
+from regil_wrappers.frames import AS_RECORDED, FrameSource, check_recorded_settings, stated
 from regil_wrappers.guide_arguments import fitting_actions
 from regil_wrappers.registration import register
 from regil_wrappers.rewards import arc_length
@@ -32,7 +32,6 @@ __all__ = [
     "check_recorded",
     "check_scene",
     "is_idle",
-    "said_of",
 ]
 
 _LABEL = "the demonstration"
@@ -68,16 +67,11 @@ def check_recorded(env: gym.Env[Any, Any], demo: Demonstration) -> list[Finding]
             check_recorded_settings(env, one, _LABEL)
         except ValueError as error:
             found.append(Finding(name.replace("_", " "), "wrong", str(error)))
-    rate, here = demo.metadata["control_rate"], said_of(env).get("control_rate")
+    rate, here = demo.metadata["control_rate"], stated(env.unwrapped.metadata).get("control_rate")
     if rate is not None and here is not None and not np.isclose(rate, here):
         line = f"recorded at {rate:g} actions a second, and the environment takes {here:g}"
         found.append(Finding("frame rate", "wrong", f"{line}: record it at the environment's"))
     return found
-
-
-def said_of(env: gym.Env[Any, Any]) -> dict[str, Any]:
-    """What an environment says of itself, ``metadata["regil"]``."""
-    return dict(env.unwrapped.metadata.get("regil") or {})
 
 
 def check_pictures(

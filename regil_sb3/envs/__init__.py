@@ -115,7 +115,9 @@ def exists_once(env: Any) -> bool:
 
     There is no second one, and what was done with it is not done again.
     """
-    return bool((env.unwrapped.metadata.get("regil") or {}).get("exists_once", False))
+    from regil_wrappers.frames import stated  # here, for ids need none of what it imports
+
+    return bool(stated(env.unwrapped.metadata).get("exists_once", False))
 
 
 def register_envs() -> None:

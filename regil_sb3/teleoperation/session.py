@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration
+from regil_wrappers.frames import stated
 
 from regil_sb3.recording import Recorder, check_seeds, make_env
 from regil_sb3.teleoperation.devices import Axes, Command, Device, make_device
@@ -152,7 +153,7 @@ class _Loop:
         live: bool,
         clock: Clock | None,
     ) -> None:
-        said = recorder.env.unwrapped.metadata.get("regil") or {}
+        said = stated(recorder.env.unwrapped.metadata)
         self._rate = float(said.get("control_rate") or _USUAL_RATE)
         self._axes = Axes.of(recorder.space, said)
         self._session = Session(recorder, seed)

@@ -225,6 +225,11 @@ def test_a_robot_is_opened_once_at_a_time(robot, tmp_path, capsys):
     assert main(["evaluate", str(run), "--episodes", "1"]) == 0
 
 
+def test_several_of_a_robot_are_refused(robot, capsys):
+    assert main([*robot, "--set", "n_envs=2"]) == 2
+    assert "OneRobot-v0 exists once: n_envs is 2, take 1" in capsys.readouterr().err
+
+
 def test_a_robot_does_nothing_again_when_a_run_goes_on(robot, tmp_path, monkeypatch, capsys):
     """Its open episode is ended, not repeated."""
     step = training.TrainingCallback._on_step

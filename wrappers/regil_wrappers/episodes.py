@@ -23,7 +23,7 @@ from regil_wrappers.correction import Servo
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.demonstrations import demonstrations, labels_of
 from regil_wrappers.episode import Episode
-from regil_wrappers.frames import FrameSource
+from regil_wrappers.frames import FrameSource, stated
 from regil_wrappers.guide import Guide
 from regil_wrappers.guide_arguments import check_guide, fitting_actions, make_servo, warn_of_rate
 from regil_wrappers.latency import Latency
@@ -189,7 +189,7 @@ class Guides:
         demos, frames = several.checked(settings)
         check_guide(guide_offset, guide_patience, correction, disturbance, len(demos))
         actions = fitting_actions(several.action_space, demos, settings["demo"])
-        told = several.metadata.get("regil") or {}
+        told = stated(several.metadata)
         warn_of_rate(told, demos, settings["demo"])
         self.episodes = _episodes(several, demos, settings, frames)
         servos: list[Servo | None] = [None] * several.n

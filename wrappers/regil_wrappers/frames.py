@@ -3,12 +3,14 @@
 * ``FrameSource`` - takes the picture out of an observation, a render or a larger frame
 * ``Asked`` - what is asked for it: an environment, or several at once
 * ``check_recorded_settings`` - camera, render settings and action repeat are those of the recording
+* ``stated`` - what an environment says of itself in its metadata
 * ``check_size``, ``check_upright`` - two first frames have one size and are the same way up
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import Any, Protocol, cast
 
 import cv2
@@ -25,6 +27,7 @@ __all__ = [
     "check_recorded_settings",
     "check_size",
     "check_upright",
+    "stated",
 ]
 
 AS_RECORDED = ("camera", "render", "action_repeat")
@@ -140,7 +143,7 @@ class FrameSource:
     @property
     def hand_starts_elsewhere(self) -> bool:
         """Whether the environment says that its hand does not start in one place."""
-        return bool((self._env.unwrapped.metadata.get("regil") or {}).get("start_std"))
+        return bool(stated(self._env.unwrapped.metadata).get("start_std"))
 
     def use_encoder_frames(self) -> bool:
         """Take the environment's larger pictures from now on, where there are such.
@@ -244,6 +247,11 @@ def _cure(space: gym.Space[Any]) -> str:
     return "use image='render'"
 
 
+def stated(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """What an environment states of itself in its ``metadata["regil"]``; nothing is fine."""
+    return dict(metadata.get("regil") or {})
+
+
 def check_recorded_settings(env: Asked, metadata: dict[str, Any], label: str) -> None:
     """Refuse a camera, render settings or action repeat other than the recording's.
 
@@ -257,7 +265,7 @@ def check_recorded_settings(env: Asked, metadata: dict[str, Any], label: str) ->
     Raises:
         ValueError: naming the setting and both values.
     """
-    here = env.unwrapped.metadata.get("regil") or {}
+    here = stated(env.unwrapped.metadata)
     for name in AS_RECORDED:
         recorded = metadata[name]
         if recorded not in (None, {}) and here.get(name, recorded) != recorded:

@@ -21,6 +21,7 @@ from regil_wrappers.alignment import StepPattern
 from regil_wrappers.correction import Servo
 from regil_wrappers.demonstrations import Demonstrations
 from regil_wrappers.encoders import Encoder
+from regil_wrappers.frames import stated
 from regil_wrappers.guide import Guide
 from regil_wrappers.guide_arguments import check_guide, fitting_actions, make_servo, warn_of_rate
 from regil_wrappers.memory import Search
@@ -126,7 +127,7 @@ class RetrievalGuideWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Record
         loaded, frames = checked(env, settings)
         check_guide(guide_offset, guide_patience, correction, disturbance, len(loaded))
         actions = fitting_actions(env.action_space, loaded, settings["demo"])
-        said = env.unwrapped.metadata.get("regil") or {}
+        said = stated(env.unwrapped.metadata)
         warn_of_rate(said, loaded, settings["demo"])
 
         gym.utils.RecordConstructorArgs.__init__(
