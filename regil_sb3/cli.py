@@ -361,21 +361,30 @@ def _train(args: argparse.Namespace) -> None:
     run = args.resume or args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-{seed}"
     try:
         if args.resume is not None:
-            training.resume(run)
+            if not training.awaits_evaluation(run):
+                training.resume(run)
         else:
             settings = make_settings(args.env, args.preset, seed, args.steps, args.set, args.algo)
             refuse_finished(run)
             demo = args.demo or default_demo(args.env)
             if not demo.exists():
-                size = encoder_size(settings)
                 try:
-                    _record(args.env, demo, seed, settings.env_kwargs, size)
+                    _record(args.env, demo, seed, settings.env_kwargs, encoder_size(settings))
                 except ValueError as error:
                     raise ValueError(
                         f"{demo} is not there ({error}): make one with `regil record`, "
                         "or name yours with --demo"
                     ) from error
-            training.train(settings, Demonstration.load(demo), run)
+            loaded = Demonstration.load(demo)
+            height, size = loaded.frames.shape[1], encoder_size(settings) or 0
+            if loaded.encoder_frames is None and height < size:
+                print(
+                    f"{demo} holds pictures of {height} px alone, which are enlarged to {size} for "
+                    f"the encoder: `regil record {args.env} --encoder-size {size}` keeps larger "
+                    "ones, where the environment draws them",
+                    file=sys.stderr,
+                )
+            training.train(settings, loaded, run)
     except (KeyboardInterrupt, Preempted, RobotError):
         if has_checkpoint(run):
             print(f"\nsaved; go on with: regil train --resume {run}", file=sys.stderr)

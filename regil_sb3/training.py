@@ -266,6 +266,17 @@ def has_learned(run: Path, settings: Settings) -> bool:
     return steps_learned(run / "model.zip") >= settings.steps
 
 
+def awaits_evaluation(run: Path) -> bool:
+    """Whether a run has learned all its steps, and was stopped before they were evaluated.
+
+    Raises:
+        ValueError: there is no run.
+    """
+    if (run / "evaluation.json").exists():
+        return False
+    return has_learned(run, Settings.load(run / "config.yaml", trust=True))
+
+
 def resume(run: Path) -> Settings:
     """Go on with a run that was interrupted, wherever it was, as if it had not been.
 

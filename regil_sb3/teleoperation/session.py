@@ -16,6 +16,7 @@ import numpy.typing as npt
 from regil_wrappers import Demonstration
 from regil_wrappers.frames import stated
 
+from regil_sb3.envs import exists_once
 from regil_sb3.recording import Recorder, check_seeds, make_env
 from regil_sb3.teleoperation.devices import Axes, Command, Device, make_device
 from regil_sb3.teleoperation.window import Window
@@ -46,6 +47,7 @@ class Session:
 
     def __init__(self, recorder: Recorder, seed: int) -> None:
         self.recorder = recorder
+        self.repeatable = not exists_once(recorder.env)
         self.said = ""
         self.begin(seed)
 
@@ -74,8 +76,11 @@ class Session:
         """Take back the last steps: the others are replayed from the same seed.
 
         Where that leads elsewhere, the environment does not repeat itself: nothing of the episode
-        can be kept then, and it begins anew.
+        can be kept then, and it begins anew. A robot is not made to repeat what it has done.
         """
+        if not self.repeatable:
+            self.said = "a robot takes nothing back: begin again"
+            return
         old, grips = self.recorder, self._grips
         keep = max(len(old) - steps, 0)
         frames, actions, seed = old.frames[: keep + 1], old.actions[:keep], old.seed
@@ -226,11 +231,11 @@ class _Loop:
         """Show the episode over and over until something is decided."""
         recorder, solved = self._recorder, self._recorder.solved
         if not solved:
-            self._session.said = (
-                "the time is over: undo and go on, or begin again"
-                if recorder.timed_out
-                else "the episode is over without success: undo and go on, or begin again"
+            why = (
+                "the time is over" if recorder.timed_out else "the episode is over without success"
             )
+            can = "undo and go on, or begin again" if self._session.repeatable else "begin again"
+            self._session.said = f"{why}: {can}"
         pause = math.ceil(_PAUSE * self._rate)
         i = 0
         while True:

@@ -105,6 +105,20 @@ def test_a_run_is_never_written_over(run, demo, capsys):
     assert "holds a run already" in capsys.readouterr().err
 
 
+def test_pictures_that_are_small_for_the_encoder(demo, tmp_path, monkeypatch, capsys):
+    def refuse(*_):
+        raise ValueError("no further")
+
+    monkeypatch.setattr(training, "train", refuse)
+    words = ["train", "--env", ENV, "--demo", str(demo), "--out", str(tmp_path / "run")]
+    assert main([*words, "--set", "encoder=efficientnet-lite0"]) == 2
+    said = capsys.readouterr().err
+    assert "pictures of 84 px alone, which are enlarged to 224" in said
+    assert f"regil record {ENV} --encoder-size 224" in said
+    assert main(words) == 2
+    assert "enlarged" not in capsys.readouterr().err
+
+
 class Killed(BaseException):
     """What a process does not survive."""
 
@@ -159,6 +173,10 @@ def test_run_killed_twice_ends_as_one_never_killed(run, demo, tmp_path, monkeypa
     assert not (folder / "checkpoints").exists()
     assert main(["train", "--resume", str(folder)]) == 2
     assert "has learned all its steps" in capsys.readouterr().err
+    (folder / "evaluation.json").rename(folder / "old.json")  # stopped before it was written
+    assert main(["train", "--resume", str(folder), "--episodes", "1"]) == 0
+    again = json.loads((folder / "evaluation.json").read_text())["policy"]["returns"]
+    assert again == ours[:1]
 
 
 def test_run_killed_before_its_second_checkpoint_ends_as_one_never_killed(

@@ -214,6 +214,22 @@ def test_an_environment_that_does_not_repeat_itself():
     assert (honest.said, len(honest.recorder), honest.closed) == ("undone: 10 steps", 0, False)
 
 
+class Robot(toy_camera.ToyCamera):
+    """There is one."""
+
+    def __init__(self):
+        super().__init__()
+        self.metadata = {**self.metadata, "regil": {"exists_once": True}}
+
+
+def test_a_robot_does_not_repeat_what_it_has_done():
+    session = Session(Recorder(Robot()), 0)
+    for _ in range(30):
+        session.step(np.float32([1, 0, 0, -1]), closed=False)
+    session.undo(20)
+    assert (session.said, len(session.recorder)) == ("a robot takes nothing back: begin again", 30)
+
+
 class Pad:
     """What pygame gives for a gamepad."""
 
