@@ -192,7 +192,7 @@ def test_success_buffers_have_a_deviation_over_seeds(tmp_path, monkeypatch, caps
     assert "| assembly | 20 ± 10 | 40 ± 20 | 60 ± 30 | - |" in lines
     assert "| **mean** | 20 | 40 | 60 | - |" in lines
     plate = "regil/libero-kitchen1-bowl-on-plate-v0"
-    for task, steps, paper in (("hammer", 5_000, "456 ± 147"), (plate, 10_000, "3024")):
+    for task, steps, paper in (("hammer", 5_000, "456 ± 147"), (plate, 20_000, "3024")):
         command[3:] = [task, "--steps", str(steps), "--out", str(tmp_path)]
         assert main(command) == 0
         (line,) = (x for x in capsys.readouterr().out.splitlines() if x.startswith(f"| {task} |"))

@@ -367,13 +367,15 @@ def test_nothing_is_listed_that_no_page_says():
 
 
 def test_job_scripts():
-    """They need a cluster: their syntax, and that their `regil` command parses."""
+    """They need a cluster: their syntax, and that their `regil` commands parse."""
     scripts = [b for page in PAGES for b in shell_blocks(page) if b.startswith("#!/bin/bash")]
     assert len(scripts) > 1
     for script in scripts:
         subprocess.run(["bash", "-n"], input=script, text=True, check=True)
-        (command,) = re.findall(r"\bregil (bench .*)", script)
-        _parser().parse_args(shlex.split(re.sub(r'"\$[^"]*"', "0", command)))
+        commands = re.findall(r"\bregil ((?:bench|train) .*)", script)
+        assert commands
+        for command in commands:
+            _parser().parse_args(shlex.split(re.sub(r'"\$[^"]*"', "0", command)))
 
 
 # Examples in docstrings: what they take for there, beside the toy and its demonstration
