@@ -6,6 +6,7 @@ often the last policy succeeds in unseen episodes. Nothing learns, and nothing i
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,7 @@ class Learned:
         seed: likewise.
         steps: that it made.
         warmup: agent steps in which the guide acted.
+        guide: its arguments, as text.
         buffer: transitions in the success buffer when they were over, the demonstration's left out.
         successes: of the last policy.
         episodes: unseen ones.
@@ -49,6 +51,7 @@ class Learned:
     seed: int
     steps: int
     warmup: int
+    guide: str
     buffer: int
     successes: int
     episodes: int
@@ -128,6 +131,9 @@ def learned(folders: Sequence[Path | str]) -> tuple[list[Learned], list[str]]:
                     settings.seed,
                     settings.steps,
                     settings.warmup_steps,
+                    json.dumps(
+                        [e for e in settings.env_wrapper if "RetrievalGuideWrapper" in str(e)]
+                    ),
                     buffer,
                     sum(outcomes),
                     len(outcomes),
@@ -141,9 +147,9 @@ def rank(runs: Sequence[Learned]) -> Rank:
 
     Runs that had the same warm-up, and differ in what came after it, count as one: their mean.
     """
-    warmups: dict[tuple[str, int, int, int], list[float]] = {}
+    warmups: dict[tuple[str, int, int, str, int], list[float]] = {}
     for run in runs:
-        same = (run.task, run.seed, run.warmup, run.buffer)
+        same = (run.task, run.seed, run.warmup, run.guide, run.buffer)
         warmups.setdefault(same, []).append(run.success)
     x = [buffer for *_, buffer in warmups]
     y = [float(np.mean(successes)) for successes in warmups.values()]

@@ -12,13 +12,14 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from regil_wrappers.formats import fuzz
 from tqdm import tqdm
 
 from regil_sb3.bench import disk_faults, hostile, lives
+from regil_sb3.bench.machine import commit
 from regil_sb3.files import replacing
 
 __all__ = ["COUNTS", "Tally", "main"]
@@ -48,6 +49,7 @@ class Tally:
         read: files that were read, faults at a call.
         refused: files refused, saves that said that they had failed.
         wrong: a line for each case that did not go as it must.
+        commits: of the code that did them.
     """
 
     done: int
@@ -55,6 +57,7 @@ class Tally:
     read: int
     refused: int
     wrong: list[str]
+    commits: list[str] = field(default_factory=list)
 
 
 def main(out: str = "faults", **counts: int) -> dict[str, Tally]:
@@ -73,7 +76,7 @@ def main(out: str = "faults", **counts: int) -> dict[str, Tally]:
     for part, count in counts.items():
         if count < 1 or (part == "disk" and count > len(disk_faults.HOW)):
             raise ValueError(f"--{part} {count}: 1 to {COUNTS['disk']} for disk, else at least 1")
-    folder = Path(out)
+    folder, here = Path(out), commit()
     folder.mkdir(parents=True, exist_ok=True)
     tallies = {}
     for part, count in (counts or COUNTS).items():
@@ -83,6 +86,7 @@ def main(out: str = "faults", **counts: int) -> dict[str, Tally]:
             tally = Tally(**json.loads(kept.read_text("utf-8")))
         with tqdm(total=count, desc=part, dynamic_ncols=True, initial=tally.done) as bar:
             for _ in _part(part, tally, count):
+                tally.commits = list(dict.fromkeys([*tally.commits, here]))
                 with replacing(kept) as file:
                     file.write(json.dumps(asdict(tally), indent=1).encode())
                 bar.update(tally.done - bar.n)
@@ -90,6 +94,8 @@ def main(out: str = "faults", **counts: int) -> dict[str, Tally]:
     print("| part | done | read | refused | wrong |\n|---|---|---|---|---|")
     for part, tally in tallies.items():
         print(f"| {part} | {tally.done} | {tally.read} | {tally.refused} | {len(tally.wrong)} |")
+    done_at = {name for tally in tallies.values() for name in tally.commits or ["not known"]}
+    print(f"\nDone at commit {', '.join(sorted(done_at))}, now {here}. To begin anew: remove {out}")
     wrong = [f"{part}: {line}" for part, tally in tallies.items() for line in tally.wrong[:_SHOWN]]
     if wrong:
         raise ValueError(f"{len(wrong)} went wrong: {'; '.join(wrong)}")

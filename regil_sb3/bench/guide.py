@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from regil_wrappers import Demonstration, RetrievalGuideWrapper
+from regil_wrappers.frames import stated
 
 from regil_sb3.bench.replay import (
     TASKS,
@@ -175,6 +176,7 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     reference = _make(task, "none")
     reference.reset(seed=int(demo.metadata["seed"]))
     home = _targets(reference)
+    step_cm = stated(reference.unwrapped.metadata).get("step_cm")
     reference.close()
 
     known = guides()
@@ -194,7 +196,9 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     corrected, errors = [], []
     for goal in goals:
         corrected.append(play(env, goal))
-        believed = [shift * env.unwrapped.metadata["regil"]["step_cm"] for shift in _believed(env)]
+        if home is None or step_cm is None:
+            continue
+        believed = [shift * step_cm for shift in _believed(env)]
         for shift, moved in zip(believed, _targets(env) - home, strict=False):
             errors.append(float(np.linalg.norm((shift - 100 * moved)[:2])))
     seconds = time.perf_counter() - start - timed.seconds
@@ -214,10 +218,9 @@ def _guided(task: str, seed: int, demo: Demonstration, disturbance: str, n: int)
     )
 
 
-def _targets(env: gym.Env[Any, Any]) -> npt.NDArray[np.float64]:
-    """(n, 3) m: where what the task is about stands, from the simulator."""
-    places: npt.NDArray[np.float64] = env.unwrapped.targets()  # type: ignore[attr-defined]
-    return places
+def _targets(env: gym.Env[Any, Any]) -> Any:
+    """(n, 3) m: where what the task is about stands, from the simulator; None: it does not say."""
+    return env.unwrapped.targets() if hasattr(env.unwrapped, "targets") else None
 
 
 def _believed(env: RetrievalGuideWrapper[Any, Any]) -> list[npt.NDArray[np.float64]]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import psutil
 
-__all__ = ["SIMULATORS", "describe", "together"]
+__all__ = ["SIMULATORS", "commit", "describe", "hardware", "together"]
 
 SIMULATORS = ("metaworld", "hf-libero", "robosuite", "mujoco")
 """Distributions that tasks are simulated with."""
@@ -25,7 +25,7 @@ def describe(packages: Sequence[str]) -> str:
         packages: distributions whose versions matter; those that are not installed are left out.
     """
     parts = [
-        f"{_processor()}, {os.cpu_count()} cores",
+        hardware(),
         f"{psutil.virtual_memory().total / 1024**3:.0f} GiB",
         *_gpus(),
         f"OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS', 'unset')}",
@@ -36,7 +36,12 @@ def describe(packages: Sequence[str]) -> str:
             parts.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
-    return ", ".join([*parts, f"commit {_commit()}"])
+    return ", ".join([*parts, f"commit {commit()}"])
+
+
+def hardware() -> str:
+    """Processor and cores."""
+    return f"{_processor()}, {os.cpu_count()} cores"
 
 
 def together(described: Iterable[str]) -> str:
@@ -72,7 +77,7 @@ def _gpus() -> list[str]:
     return [line.replace(", ", " (driver ") + ")" for line in dict.fromkeys(told.splitlines())]
 
 
-def _commit() -> str:
+def commit() -> str:
     """Of the checkout that this file is of, with a + where its code or presets were changed."""
     here = Path(__file__).parent
     asked = (

@@ -29,6 +29,7 @@ import regil_sb3  # registers the environments  # noqa: F401
 from regil_sb3 import process
 from regil_sb3.background import BackgroundTD3BC
 from regil_sb3.bench.cells import Cell, below, finish, rows
+from regil_sb3.bench.machine import hardware
 from regil_sb3.bench.page import need_parquet, write
 from regil_sb3.recording import check_seeds, record_expert
 from regil_sb3.settings import make_settings
@@ -157,6 +158,7 @@ def planned(
                     Path(out) / "cells",
                     {
                         "measured": "control in real time",
+                        "machine": hardware(),  # one's times say nothing of another's
                         "env": f"regil/rehearsal-{task}-v0",
                         "seed": seed,
                         "steps": steps,

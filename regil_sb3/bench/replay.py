@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any
@@ -100,7 +101,7 @@ def check(tasks: Sequence[str], seeds: Sequence[int], **counts: int) -> None:
     for seed in seeds:
         check_seeds(seed)
     for option, values in (("tasks", tasks), ("seeds", seeds)):
-        if len(set(values)) < len(values):
+        if len({env_id(v) if isinstance(v, str) else v for v in values}) < len(values):
             raise ValueError(f"--{option} {' '.join(map(str, values))}: name each once")
     for option, count in counts.items():
         if count < 1:
@@ -117,7 +118,10 @@ def demonstration(task: str, seed: int, encoder: str = "pixels") -> Demonstratio
         encoder: name of the one that the guide has.
     """
     size = getattr(make_encoder(encoder), "frame_size", None)
-    return record_expert(env_id(task), seed, env_kwargs(task), size)
+    demo = record_expert(env_id(task), seed, env_kwargs(task), size)
+    if (of := demo.metadata["seed"]) != seed:
+        warnings.warn(f"{task}: the expert fails at seed {seed}, {of} is taken", stacklevel=2)
+    return demo
 
 
 def play(env: RetrievalGuideWrapper[Any, Any], seed: int) -> bool:
@@ -128,9 +132,10 @@ def play(env: RetrievalGuideWrapper[Any, Any], seed: int) -> bool:
 
 def follow(env: RetrievalGuideWrapper[Any, Any]) -> tuple[bool, int]:
     """Follow the guide to the episode's end: whether it succeeded, and agent steps."""
-    steps, over, info = 0, False, {"is_success": False}
+    steps, over, success = 0, False, False
     while not over:
         *_, terminated, truncated, info = env.step(env.guide_action())
         over = terminated or truncated
+        success |= bool(info.get("is_success", False))  # on the way, too, as in evaluations
         steps += 1
-    return bool(info["is_success"]), steps
+    return success, steps

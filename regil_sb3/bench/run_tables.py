@@ -19,7 +19,15 @@ import numpy as np
 from regil_sb3.bench.machine import together
 from regil_sb3.bench.page import need_parquet, said, write
 from regil_sb3.bench.replay import check, env_id, task_of
-from regil_sb3.bench.runs import Run, finish_all, machines, others, predicted_hours, seconds_of
+from regil_sb3.bench.runs import (
+    Run,
+    finish_all,
+    machines,
+    others,
+    predicted_hours,
+    same_demonstrations,
+    seconds_of,
+)
 from regil_sb3.intervals import Interval, iqm
 
 __all__ = ["LEARNING", "main", "planned", "raw", "table"]
@@ -172,8 +180,8 @@ def table(runs: Sequence[Run]) -> list[str]:
         ]
         found = iqm(scores)
         reached = [_median(by_run.values(), f"steps to {level}") for level in LEVELS]
-        minutes = np.mean([row["minutes"] for row in by_run.values()])
-        took = "-" if np.isnan(minutes) else f"{minutes:.1f}"
+        minutes = [row["minutes"] for row in by_run.values() if not np.isnan(row["minutes"])]
+        took = f"{np.mean(minutes):.1f}" if minutes else "-"
         cells += [_interval(found), str(len(by_run)), *reached, took]
         lines.append(f"| {method} | " + " | ".join(cells) + " |")
     return lines
@@ -268,6 +276,7 @@ def main(
     runs = planned(name, out, **options)
     if stale := others(runs):
         raise ValueError("; ".join(stale))
+    same_demonstrations(runs)
     missing = [run for run in runs if not run.finished]
     if dry_run:
         for run in runs:

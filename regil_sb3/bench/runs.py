@@ -104,7 +104,7 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Whether it is trained and evaluated, in as many episodes and as all that is asked for.
+        """Whether it has made all steps, and is evaluated as often and as all that is asked for.
 
         Raises:
             ValueError: ``evaluation.json`` is damaged.
@@ -116,11 +116,12 @@ class Run:
             found = json.loads(path.read_text("utf-8"))
             episodes = len(found["policy"]["successes"])
             asked = {*found.get("asked", found)}
+            learned = int(found.get("steps", self.steps)) >= self.steps  # else it was looked at on its way
         except (ValueError, LookupError, TypeError, AttributeError):
             raise ValueError(
                 f"{path} is no evaluation: remove it, and the run is evaluated again"
             ) from None
-        return episodes >= self.episodes and {*dict(self.beside).values()} <= asked
+        return learned and episodes >= self.episodes and {*dict(self.beside).values()} <= asked
 
     @property
     def command(self) -> str:
@@ -157,6 +158,12 @@ def _write_took(run: Run, seconds: float, here: str, demo: str) -> None:
         file.write(json.dumps(told).encode())
 
 
+def _demo_of(run: Run) -> Path:
+    """The demonstration that it learns from: one that was begun has its own."""
+    own = run.folder / "demo.hdf5"
+    return own if own.exists() and (run.folder / "config.yaml").exists() else Path(run.demo)
+
+
 def _digest(demo: str) -> str:
     """Of what a demonstration's file holds."""
     from regil_wrappers import Demonstration
@@ -167,13 +174,24 @@ def _digest(demo: str) -> str:
     return found.hexdigest()[:20]
 
 
-def _same_demonstrations(runs: Sequence[Run]) -> None:
-    """Refuse to put runs beside others of another demonstration.
+def same_demonstrations(runs: Sequence[Run]) -> None:
+    """Refuse to put runs beside others of another demonstration, or two seeds of one.
+
+    Runs of older versions do not say theirs; nor is it known what is not there.
 
     Raises:
-        ValueError: one was made with another than is there now.
+        ValueError: one was made with another than is there now, or two of those that are there
+            are the same.
     """
     here = {demo: _digest(demo) for demo in {run.demo for run in runs} if Path(demo).exists()}
+    of: dict[str, str] = {}
+    for demo, digest in sorted(here.items()):
+        if digest in of:
+            raise ValueError(
+                f"{of[digest]} and {demo} are one demonstration (the expert fails at a seed, and "
+                "takes the next): name other --seeds"
+            )
+        of[digest] = demo
     for run in runs:
         told = _took(run).get("demo")
         if None not in (told, now := here.get(run.demo)) and told != now:
@@ -265,7 +283,7 @@ def finish(run: Run, patience: float = _GRACE) -> None:
         return
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the run's, and said below tables
     begun, took, here = time.time(), seconds_of(run) or 0.0, describe(_PACKAGES)
-    demo, written = _digest(run.demo), begun
+    demo, written = _digest(str(_demo_of(run))), begun
     _write_took(run, took, here, demo)
     process = get_context("spawn").Process(target=_train, args=(run,))
     process.start()
@@ -274,14 +292,16 @@ def finish(run: Run, patience: float = _GRACE) -> None:
             process.join(1.0)  # Ray's way to interrupt waits for Python's own code
             if time.time() > written + _NOTED_EVERY:  # this process may be killed, too
                 written = time.time()
-                _write_took(run, took + written - begun, here, demo)
+                with suppress(OSError):  # the run itself outlives a disk that fails for a moment
+                    _write_took(run, took + written - begun, here, demo)
     except BaseException:
         assert process.pid is not None
         os.kill(process.pid, signal.SIGINT)  # it saves itself
         process.join(_GRACE)
         raise
     finally:
-        _write_took(run, took + time.time() - begun, here, demo)
+        with suppress(OSError):
+            _write_took(run, took + time.time() - begun, here, demo)
     if process.exitcode or not run.finished:
         from regil_sb3.checkpoint.callback import TRY_AGAIN
 
@@ -372,11 +392,12 @@ def finish_all(
         raise ValueError(f"a run cannot have {shares}: a share is 0 or more")
     todo = [run for run in runs if not run.finished]
     if not todo:
+        same_demonstrations(runs)
         return []
     if ray:
         connect(ray, shares)
     _record(todo)
-    _same_demonstrations(runs)
+    same_demonstrations(runs)
     with tqdm(total=sum(run.steps for run in todo), unit="step", dynamic_ncols=True) as bar:
 
         def show() -> None:

@@ -356,7 +356,7 @@ def main(
         f"{minutes:.1f} minutes; {describe(packages)}"
     )
     folder = Path(out)
-    options = {"runs": runs, "episodes": episodes}
+    options = {"runs": runs, "episodes": episodes, **({"trust": True} if trust else {})}
     write(folder, name, options, lines, below, list(_rows(found)))
     _draw(found, folder / f"{name}.png")
     print("\n".join([*lines, "", below]))

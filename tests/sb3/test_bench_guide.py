@@ -50,6 +50,11 @@ def test_corrected_replay_of_one_task():
     assert first.said == ""
 
 
+def test_a_task_that_does_not_say_where_its_targets_are():
+    (found,) = guide.guide(["regil/rehearsal-reach-v0"], episodes=1, seeds=[0])
+    assert (len(found.corrected), found.errors_cm) == (1, [])
+
+
 def test_disturbances_change_pictures_and_repeat_themselves():
     def frames(name):
         env = guide._make("button-press", name)
@@ -88,6 +93,10 @@ def test_disturbances_change_pictures_and_repeat_themselves():
         (["guide", "--disturbances", "camera", "--tasks", LIFT], "only Meta-World's cameras"),
         (["success-buffer", "--episodes", "9"], "'success-buffer' has no option --episodes"),
         (["success-buffer", "--seeds", "1", "1"], "--seeds 1 1: name each once"),
+        (
+            ["success-buffer", "--tasks", "hammer", "regil/metaworld-hammer-v0"],
+            "--tasks hammer regil/metaworld-hammer-v0: name each once",
+        ),
         (["success-buffer", "--seeds", "1000000"], "must lie between 0 and 999999"),
         (["success-buffer", "--steps", "0"], "--steps 0: at least 1"),
         (["sensitivity", "--steps", "9"], "'sensitivity' has no option --steps"),

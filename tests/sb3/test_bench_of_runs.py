@@ -58,7 +58,7 @@ def test_runs_that_say_too_little_are_left_out(tmp_path):
     names = ("good", "unguided", "short", "running", "unregularised")
     found, left_out = learned([tmp_path / name for name in names])
     good = str(tmp_path / "good")
-    assert found == [Learned(good, "hammer", "default", 4, 15_000, 2_000, 100, 19, 20)]
+    assert found == [Learned(good, "hammer", "default", 4, 15_000, 2_000, "[]", 100, 19, 20)]
     assert [line.rpartition(": ")[2].split(" (")[0] for line in left_out] == [
         "no guide acted in it",
         "its log does not reach the end of the warm-up",
@@ -68,14 +68,16 @@ def test_runs_that_say_too_little_are_left_out(tmp_path):
 
 
 def test_ranks():
-    def runs(pairs):
-        same = ("", "hammer", "default", 0, 15_000, 2_000)
+    def runs(pairs, guide=""):
+        same = ("", "hammer", "default", 0, 15_000, 2_000, guide)
         return [Learned(*same, buffer, solved, 20) for buffer, solved in pairs]
 
     grows = rank(runs([(100, 3), (200, 5), (300, 9), (5_000, 10)]))
     assert (grows.rho, grows.n) == (pytest.approx(1), 4)
     assert grows.p == pytest.approx(2 / 24)  # of 24 orders, two are as extreme
     assert rank(runs([(1, 9), (2, 5), (3, 1)])).rho == pytest.approx(-1)
+    both = [*runs([(1, 9), (2, 5), (3, 1)]), *runs([(3, 1)], "another")]
+    assert rank(both).n == 4  # as much was left by another guide
     # what had the same warm-up counts once: its mean
     assert rank(runs([(1, 9), (2, 2), (2, 8), (3, 1), (3, 1)])) == rank(
         runs([(1, 9), (2, 5), (3, 1)])

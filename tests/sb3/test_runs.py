@@ -111,6 +111,9 @@ def test_more_is_evaluated_of_a_run_that_has_learned(runs, failed, tmp_path, mon
     assert others([run]) == []
     (line,) = others([replace(run, episodes=4)])
     assert "its model is gone: remove it" in line
+    told = json.loads((run.folder / "evaluation.json").read_text())
+    (run.folder / "evaluation.json").write_text(json.dumps({**told, "steps": run.steps - 1}))
+    assert not run.finished  # somebody looked at it on its way
     (run.folder / "evaluation.json").write_text('{"policy": 3}')
     with pytest.raises(ValueError, match="is no evaluation: remove it"):
         run.finished  # noqa: B018
@@ -234,12 +237,18 @@ def test_what_is_written(runs, failed, tmp_path, monkeypatch, capsys):
 def test_runs_beside_others_have_their_demonstration(runs, failed, tmp_path):
     shutil.copytree(runs[0].folder, tmp_path / runs[0].folder.name)
     kept, more = (replace(run, root=str(tmp_path)) for run in runs[:2])
-    runs_module._same_demonstrations([kept, more])
+    runs_module.same_demonstrations([kept, more])
     other = str(tmp_path / "other.hdf5")
     demonstration(0.5).save(other)
     with pytest.raises(ValueError, match=r"was made with another demonstration .* bring its"):
         finish_all([replace(run, demo=other) for run in (kept, more)])
     assert not more.folder.exists()
+    with pytest.raises(ValueError, match="was made with another demonstration"):
+        finish_all([replace(runs[1], demo=other)])  # nothing would be made
+    shutil.copy(other, tmp_path / "same.hdf5")
+    twice = [replace(more, demo=other), replace(more, seed=2, demo=str(tmp_path / "same.hdf5"))]
+    with pytest.raises(ValueError, match="are one demonstration"):
+        finish_all(twice)
 
 
 def killed_once(run):
