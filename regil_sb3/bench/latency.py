@@ -39,7 +39,7 @@ _K, _HORIZON = 5, 4
 _ENVIRONMENTS = 8
 _SHIFT = 7  # frames between two environments' episodes
 _NOISE = 5.0  # std of the episode's, of 255
-_PAIR_S = 40.0  # seconds of an encoder with a demonstration, roughly
+_PAIR_S = 77.0  # seconds of an encoder with a demonstration, measured on two idle cores
 _PACKAGES = ("numpy", "torch", "timm", "opencv-python-headless", "tslearn", "dtaidistance")
 
 _ONE = "1 environment"
