@@ -156,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
         "table",
         help="rendering, retrieval, ranking, guide, success-buffer, sensitivity, latency, "
         "real-time, memory, index, throughput, faults; "
-        "baselines, ablations, rewards (training runs); "
+        "baselines, ablations, rewards, tuning (training runs); "
         "buffer-vs-learning, trajectories (of runs that have ended); results (a page of all that "
         "is kept)",
     )

@@ -116,7 +116,8 @@ class Run:
             found = json.loads(path.read_text("utf-8"))
             episodes = len(found["policy"]["successes"])
             asked = {*found.get("asked", found)}
-            learned = int(found.get("steps", self.steps)) >= self.steps  # else it was looked at on its way
+            # else it was looked at on its way
+            learned = int(found.get("steps", self.steps)) >= self.steps
         except (ValueError, LookupError, TypeError, AttributeError):
             raise ValueError(
                 f"{path} is no evaluation: remove it, and the run is evaluated again"

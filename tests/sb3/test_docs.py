@@ -164,6 +164,7 @@ DRY = {
     "ablations": "each cell is a training run in a process of its own: test_runs.py makes some",
     "baselines": "likewise",
     "rewards": "likewise",
+    "tuning": "likewise",
     "real-time": "at least 1,000 steps by the wall clock, twice: test_bench_real_time.py",
 }
 # Options that make a command small; argparse takes the last
