@@ -6,6 +6,7 @@ import copy
 import difflib
 import inspect
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from importlib import import_module, resources
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -244,6 +245,11 @@ def comparisons() -> dict[str, Any]:
 
 
 def _zoo_config(name: str) -> dict[str, Any]:
+    return copy.deepcopy(_read_zoo_config(name))
+
+
+@cache
+def _read_zoo_config(name: str) -> dict[str, Any]:
     text = (resources.files("regil_sb3.zoo_configs") / name).read_text(encoding="utf-8")
     sections: dict[str, Any] = yaml.safe_load(text)
     return sections
