@@ -516,6 +516,18 @@ def test_a_place_that_takes_several_steps_turns_the_hand_once(known: dict[str, A
     assert turned == pytest.approx([0, 3, 0], abs=1e-5)
 
 
+def test_a_gripper_whose_largest_action_is_0(known: dict[str, Any]) -> None:
+    """What is off is measured against half of the range."""
+    low, high = -np.ones(4, np.float32), np.array([1, 1, 1, 0], np.float32)
+    servo = Servo((84, 84), np.zeros((8, 4), np.float32), low, high)
+    servo.load_state(known)
+    servo.reset(kind="plain")
+    action, picture = np.zeros(4, np.float32), np.zeros((84, 84, 3), np.uint8)
+    for gripper, followed in ((-0.2, True), (-0.3, False)):
+        servo.executed(np.array([0, 0, 0, gripper], np.float32), action, picture)
+        assert servo._followed == followed
+
+
 def test_limits_that_differ_by_direction(known: dict[str, Any]) -> None:
     """The hand goes as far as the environment lets it, and no farther than that is believed."""
     low = np.array([-1, -0.2, -1, -1], np.float32)

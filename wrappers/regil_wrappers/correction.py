@@ -246,7 +246,8 @@ class Servo:
 
         A replay may be disturbed by noise; calibration moves may not.
         """
-        off = float((np.abs(action - suggested) / np.maximum(self._high, 1e-9)).max())
+        full = np.maximum((self._high - self._low) / 2, 1e-9)
+        off = float((np.abs(action - suggested) / full).max())
         self._followed = self._followed and off <= _DISTURBED
         if self._moving and self._calibration is not None:
             self._calibrated_here = True
