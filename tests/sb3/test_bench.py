@@ -25,7 +25,7 @@ def test_unknown_table_gets_one_line():
         ValueError,
         match=r"^table 'speed' is not one of rendering, retrieval, ranking, guide, success-buffer, "
         r"sensitivity, buffer-vs-learning, trajectories, real-time, results, latency, memory, "
-        r"index, throughput, faults, ablations, baselines, rewards$",
+        r"index, throughput, faults, ablations, baselines, rewards, tuning$",
     ):
         tables.main("speed")
     with pytest.raises(ValueError, match=r"^the table 'retrieval' has no option --steps$"):
