@@ -361,23 +361,22 @@ def _train(args: argparse.Namespace) -> None:
     run = args.resume or args.out or Path("runs") / f"{args.env.rpartition('/')[2]}-{seed}"
     try:
         if args.resume is not None:
-            if not training.awaits_evaluation(run):
-                training.resume(run)
+            training.resume(run)
         else:
             settings = make_settings(args.env, args.preset, seed, args.steps, args.set, args.algo)
             refuse_finished(run)
-            demo = args.demo or default_demo(args.env)
+            demo, size = args.demo or default_demo(args.env), encoder_size(settings)
             if not demo.exists():
                 try:
-                    _record(args.env, demo, seed, settings.env_kwargs, encoder_size(settings))
+                    _record(args.env, demo, seed, settings.env_kwargs, size)
                 except ValueError as error:
                     raise ValueError(
                         f"{demo} is not there ({error}): make one with `regil record`, "
                         "or name yours with --demo"
                     ) from error
             loaded = Demonstration.load(demo)
-            height, size = loaded.frames.shape[1], encoder_size(settings) or 0
-            if loaded.encoder_frames is None and height < size:
+            height = loaded.frames.shape[1]
+            if size is not None and loaded.encoder_frames is None and height < size:
                 print(
                     f"{demo} holds pictures of {height} px alone, which are enlarged to {size} for "
                     f"the encoder: `regil record {args.env} --encoder-size {size}` keeps larger "

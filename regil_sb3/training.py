@@ -81,21 +81,21 @@ def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEn
         ValueError: the environment, its arguments or the demonstration do not fit.
     """
     wrappers = settings.wrappers(str(demo))
+    n_envs = n_envs or settings.n_envs
 
     def wrap(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+        once = exists_once(env)
+        if once and n_envs > 1:
+            env.close()
+            raise ValueError(f"{settings.env} exists once: n_envs is {n_envs}, take 1")
         for wrapper, arguments in wrappers:
             env = wrapper(env, **arguments)
-        if not exists_once(env):
-            return ReplayableEpisode(env)
-        if (n_envs or settings.n_envs) > 1:
-            env.close()
-            raise ValueError(f"{settings.env} exists once: n_envs is {settings.n_envs}, take 1")
-        return env
+        return env if once else ReplayableEpisode(env)
 
     try:
         env: VecEnv = make_vec_env(
             settings.env,
-            n_envs=n_envs or settings.n_envs,
+            n_envs=n_envs,
             seed=settings.seed,
             wrapper_class=wrap,
             env_kwargs=settings.env_kwargs,
@@ -266,23 +266,12 @@ def has_learned(run: Path, settings: Settings) -> bool:
     return steps_learned(run / "model.zip") >= settings.steps
 
 
-def awaits_evaluation(run: Path) -> bool:
-    """Whether a run has learned all its steps, and was stopped before they were evaluated.
-
-    Raises:
-        ValueError: there is no run.
-    """
-    if (run / "evaluation.json").exists():
-        return False
-    return has_learned(run, Settings.load(run / "config.yaml", trust=True))
-
-
 def resume(run: Path) -> Settings:
     """Go on with a run that was interrupted, wherever it was, as if it had not been.
 
     One that learns from the demonstration alone has no checkpoints: it goes on from the model that
     Ctrl-C or an evaluation saved last, or begins anew. A run is one's own: an encoder that its
-    config names as code is run.
+    config names as code is run. Of one that was stopped in its evaluation nothing is left to learn.
 
     Raises:
         ValueError: no run, or one that has ended already.
@@ -292,6 +281,8 @@ def resume(run: Path) -> Settings:
     offline = issubclass(ALGOS[settings.algo], Offline)
     with locked(run):
         if has_learned(run, settings):
+            if not (run / "evaluation.json").exists():
+                return settings
             raise ValueError(
                 f"{run} has learned all its steps: start a new run, or use `regil evaluate` on "
                 "this one"

@@ -100,8 +100,9 @@ def check(tasks: Sequence[str], seeds: Sequence[int], **counts: int) -> None:
             raise ValueError(f"--tasks {task}: choose from {known}, or an environment's id")
     for seed in seeds:
         check_seeds(seed)
+    different = {"tasks": len({*map(env_id, tasks)}), "seeds": len({*seeds})}
     for option, values in (("tasks", tasks), ("seeds", seeds)):
-        if len({env_id(v) if isinstance(v, str) else v for v in values}) < len(values):
+        if different[option] < len(values):
             raise ValueError(f"--{option} {' '.join(map(str, values))}: name each once")
     for option, count in counts.items():
         if count < 1:

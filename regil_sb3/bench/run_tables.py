@@ -276,9 +276,9 @@ def main(
     runs = planned(name, out, **options)
     if stale := others(runs):
         raise ValueError("; ".join(stale))
-    same_demonstrations(runs)
     missing = [run for run in runs if not run.finished]
     if dry_run:
+        same_demonstrations(runs)
         for run in runs:
             print(f"{run.folder}: {'finished' if run.finished else run.command}")
         at_a_time = "one after the other" if ray else f"{workers} at a time"

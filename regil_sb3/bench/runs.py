@@ -165,7 +165,7 @@ def _demo_of(run: Run) -> Path:
     return own if own.exists() and (run.folder / "config.yaml").exists() else Path(run.demo)
 
 
-def _digest(demo: str) -> str:
+def _digest(demo: Path | str) -> str:
     """Of what a demonstration's file holds."""
     from regil_wrappers import Demonstration
 
@@ -284,7 +284,7 @@ def finish(run: Run, patience: float = _GRACE) -> None:
         return
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # the run's, and said below tables
     begun, took, here = time.time(), seconds_of(run) or 0.0, describe(_PACKAGES)
-    demo, written = _digest(str(_demo_of(run))), begun
+    demo, written = _digest(_demo_of(run)), begun
     _write_took(run, took, here, demo)
     process = get_context("spawn").Process(target=_train, args=(run,))
     process.start()
@@ -392,13 +392,12 @@ def finish_all(
     if min(shares) < 0:
         raise ValueError(f"a run cannot have {shares}: a share is 0 or more")
     todo = [run for run in runs if not run.finished]
-    if not todo:
-        same_demonstrations(runs)
-        return []
-    if ray:
+    if ray and todo:
         connect(ray, shares)
     _record(todo)
     same_demonstrations(runs)
+    if not todo:
+        return []
     with tqdm(total=sum(run.steps for run in todo), unit="step", dynamic_ncols=True) as bar:
 
         def show() -> None:
