@@ -4,6 +4,7 @@
 - ``ResNet18Encoder``: ResNet-18 with group normalisation, by name, for the paper preset.
 - ``random_shift``: the augmentation of DrQ (https://arxiv.org/abs/2004.13649).
 - ``ImagePolicy``: TD3's policy on images, one encoder for actor and critic each, or shared.
+- ``average_in``: the running average of an actor's weights, while cloning alone trains it.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 _DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
+_AVERAGED = 10  # of the first updates: the average takes in about a tenth of those done
 
 
 def random_shift(images: th.Tensor, pad: int) -> th.Tensor:
@@ -188,6 +191,22 @@ def orthogonal(module: nn.Module) -> None:
         nn.init.orthogonal_(module.weight)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
+
+
+def average_in(actor: nn.Module, average: nn.Module, updates: int, tau: float) -> None:
+    """Take an actor's weights into their running average after an update by cloning alone.
+
+    The average spans about the last tenth of the updates done, and 1 / ``tau`` at most, so that
+    little of the weights it began with is left early on.
+
+    Args:
+        actor: as it is now.
+        average: the same network, changed in place.
+        updates: done so far, this one included.
+        tau: the least share of the new weights, in (0, 1].
+    """
+    share = max(tau, _AVERAGED / (updates + _AVERAGED))
+    polyak_update(actor.parameters(), average.parameters(), share)
 
 
 class ImagePolicy(TD3Policy):

@@ -38,15 +38,12 @@ from regil_sb3.bc_schedule import BySuccess, by_time
 from regil_sb3.collection import Collection
 from regil_sb3.guided import guide_actions
 from regil_sb3.model_file import SafeLoad
-from regil_sb3.policies import ImagePolicy
+from regil_sb3.policies import ImagePolicy, average_in
 from regil_sb3.relabelling import EpisodeRewards, episode_reward_class, rewards_come_late
 from regil_sb3.replay_buffer import FrameReplayBuffer, truncate_newest
 from regil_sb3.success_buffer import SuccessBuffer
 
 SelfTD3BC = TypeVar("SelfTD3BC", bound="TD3BC")
-
-
-_AVERAGED = 10  # of the first BC updates: the average takes in about a tenth of those done
 
 
 class TD3BC(SafeLoad, TD3):
@@ -526,8 +523,7 @@ class TD3BC(SafeLoad, TD3):
             loss.backward()  # type: ignore[no-untyped-call]
             self._require_finite_gradient("actor", self.actor)
             self.actor.optimizer.step()
-            share = max(self.tau, _AVERAGED / (done + _AVERAGED))
-            polyak_update(self.actor.parameters(), self.actor_target.parameters(), share)
+            average_in(self.actor, self.actor_target, done, self.tau)
             if progress is not None:
                 progress(done)
         self.logger.record("train/bc_loss", loss.item())

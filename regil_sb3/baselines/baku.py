@@ -1,11 +1,13 @@
 """BAKU: a transformer over observation and action tokens that clones chunks of actions.
 
-* ``BAKUPolicy`` - the network, and how its chunks become actions
+* ``BAKUNetwork`` - what it learns
+* ``BAKUPolicy`` - how its chunks become actions, and the average of its weights
 * ``BAKU`` - trains it on the demonstration
 """
 
 from __future__ import annotations
 
+from copy import deepcopy
 from os import PathLike
 from typing import Any, ClassVar, Literal
 
@@ -15,7 +17,7 @@ import torch as th
 from gymnasium import spaces
 from regil_wrappers import Demonstration
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
@@ -26,19 +28,74 @@ from regil_sb3.arguments import check_action_space, check_device, check_number
 from regil_sb3.as_seen import as_seen
 from regil_sb3.baselines.offline import Offline
 from regil_sb3.model_file import SafeLoad
-from regil_sb3.policies import encoder_class, orthogonal, random_shift
+from regil_sb3.policies import average_in, encoder_class, orthogonal, random_shift
 
 _LOG_STD = (-3.0, 1.0)  # limits of the Gaussian head's
+_TAU = 0.005  # TD3's own: how fast the average follows the weights
+
+
+class BAKUNetwork(nn.Module):
+    """Encoder, transformer over [observation, action token], and a head for a chunk of actions.
+
+    Args:
+        features_extractor: makes the observation's token, (B, C, H, W) -> (B, width).
+        actions: dimensions of an action.
+        chunk: actions predicted at once.
+        layers: of the transformer.
+        heads: of its attention.
+        dropout: in the transformer.
+        gaussian: whether the head says deviations, too.
+    """
+
+    def __init__(
+        self,
+        features_extractor: BaseFeaturesExtractor,
+        actions: int,
+        chunk: int,
+        layers: int,
+        heads: int,
+        dropout: float,
+        gaussian: bool,
+    ) -> None:
+        super().__init__()
+        self.chunk, self.actions, self.gaussian = chunk, actions, gaussian
+        width = features_extractor.features_dim
+        self.features_extractor = features_extractor
+        self.features_extractor.apply(orthogonal)
+        self.action_token = nn.Parameter(0.02 * th.randn(1, 1, width))
+        self.positions = nn.Parameter(0.02 * th.randn(1, 2, width))
+        layer = nn.TransformerEncoderLayer(
+            width, heads, 4 * width, dropout, F.gelu, batch_first=True, norm_first=True
+        )
+        # With a causal mask an "encoder" is a decoder of GPT's kind
+        self.trunk = nn.TransformerEncoder(
+            layer, layers, nn.LayerNorm(width), enable_nested_tensor=False
+        )
+        self.register_buffer("mask", nn.Transformer.generate_square_subsequent_mask(2))
+        self.head = nn.Sequential(
+            nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(),
+            nn.Linear(width, chunk * actions * (2 if gaussian else 1)),
+        )  # fmt: skip
+
+    def forward(self, images: th.Tensor) -> tuple[th.Tensor, th.Tensor | None]:
+        """Means (B, chunk, A) in [-1, 1], and logarithms of deviations where the head has them."""
+        seen = self.features_extractor(images)
+        tokens = th.stack([seen, self.action_token[:, 0].expand_as(seen)], dim=1)
+        out = self.head(self.trunk(tokens + self.positions, mask=self.mask, is_causal=True)[:, -1])
+        out = out.reshape(len(seen), -1, self.chunk, self.actions)
+        log_std = out[:, 1].clamp(*_LOG_STD) if self.gaussian else None
+        return th.tanh(out[:, 0]), log_std
 
 
 class BAKUPolicy(BasePolicy):
-    """Encoder, transformer over [observation, action token], and a head for a chunk of actions.
+    """Acts by what a ``BAKUNetwork`` said of the present step, now and before.
 
     The action token is learned; what the transformer makes of it, having seen the observation, goes
     through the head to ``chunk`` actions at once. Acting averages what the last ``chunk``
     observations said of the present step, with weight exp(-smoothing * i) for the i-th oldest
     (temporal ensembling, https://arxiv.org/abs/2304.13705); the state that ``predict`` takes and
-    returns holds these chunks. Without it only the newest chunk counts.
+    returns holds these chunks. Without it only the newest chunk counts. ``actor`` is the network
+    that is trained, ``actor_target`` the running average of its weights.
 
     Args:
         observation_space: images, channels first.
@@ -51,6 +108,7 @@ class BAKUPolicy(BasePolicy):
         dropout: in the transformer.
         head: "mse" (squared error) or "gaussian" (negative log likelihood, the deviation learned).
         smoothing: see above; 0 weighs all chunks alike.
+        averaged: whether ``actor_target`` acts, as in ``ImagePolicy``, or ``actor``.
         features_extractor_class: "conv", "resnet18", or a class that takes ``features_dim``.
         features_extractor_kwargs: for it, beside ``features_dim``.
         random_shift: largest shift of the augmentation, in pixels.
@@ -73,6 +131,7 @@ class BAKUPolicy(BasePolicy):
         dropout: float = 0.1,
         head: Literal["mse", "gaussian"] = "mse",
         smoothing: float = 0.01,
+        averaged: bool = True,
         features_extractor_class: str | type[BaseFeaturesExtractor] = "conv",
         features_extractor_kwargs: dict[str, Any] | None = None,
         random_shift: int = 4,
@@ -101,47 +160,31 @@ class BAKUPolicy(BasePolicy):
         )
         self.chunk, self.width, self.layers, self.heads = chunk, width, layers, heads
         self.dropout, self.head_kind, self.smoothing = dropout, head, smoothing
-        self.random_shift = random_shift
+        self.averaged, self.random_shift = averaged, random_shift
         assert action_space.shape is not None
-        self.actions = int(np.prod(action_space.shape))
-
-        self.features_extractor = self.make_features_extractor()
-        self.features_extractor.apply(orthogonal)
-        self.action_token = nn.Parameter(0.02 * th.randn(1, 1, width))
-        self.positions = nn.Parameter(0.02 * th.randn(1, 2, width))
-        layer = nn.TransformerEncoderLayer(
-            width, heads, 4 * width, dropout, F.gelu, batch_first=True, norm_first=True
+        actions = int(np.prod(action_space.shape))
+        self.actor = BAKUNetwork(
+            self.make_features_extractor(), actions, chunk, layers, heads, dropout, head != "mse"
         )
-        # With a causal mask an "encoder" is a decoder of GPT's kind
-        self.trunk = nn.TransformerEncoder(
-            layer, layers, nn.LayerNorm(width), enable_nested_tensor=False
-        )
-        self.register_buffer("mask", nn.Transformer.generate_square_subsequent_mask(2))
-        outputs = chunk * self.actions * (2 if head == "gaussian" else 1)
-        self.head = nn.Sequential(
-            nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(),
-            nn.Linear(width, outputs),
-        )  # fmt: skip
+        self.actor_target = deepcopy(self.actor).requires_grad_(False)
         self.optimizer = self.optimizer_class(
-            self.parameters(),
+            self.actor.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]
             **self.optimizer_kwargs,
         )
 
-    def forward(self, observations: PyTorchObs) -> tuple[th.Tensor, th.Tensor | None]:
-        """Means (B, chunk, A) in [-1, 1], and logarithms of deviations where the head has them."""
-        assert isinstance(observations, th.Tensor)
-        assert self.features_extractor is not None
-        seen = self.extract_features(observations, self.features_extractor)
-        tokens = th.stack([seen, self.action_token[:, 0].expand_as(seen)], dim=1)
-        out = self.head(self.trunk(tokens + self.positions, mask=self.mask, is_causal=True)[:, -1])
-        out = out.reshape(len(seen), -1, self.chunk, self.actions)
-        log_std = out[:, 1].clamp(*_LOG_STD) if self.head_kind == "gaussian" else None
-        return th.tanh(out[:, 0]), log_std
+    def forward(
+        self, observations: PyTorchObs, actor: BAKUNetwork
+    ) -> tuple[th.Tensor, th.Tensor | None]:
+        """What a network says of observations as SB3 keeps them; see ``BAKUNetwork.forward``."""
+        said: tuple[th.Tensor, th.Tensor | None] = actor(
+            preprocess_obs(observations, self.observation_space, self.normalize_images)
+        )
+        return said
 
     def loss(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Of a batch: observations (B, C, H, W), and the actions (B, chunk, A) that followed."""
-        mean, log_std = self(random_shift(observations, self.random_shift))
+        mean, log_std = self(random_shift(observations, self.random_shift), self.actor)
         error = F.mse_loss(mean, actions, reduction="none")
         if log_std is not None:
             error = error / (2.0 * th.exp(2.0 * log_std)) + log_std
@@ -149,7 +192,7 @@ class BAKUPolicy(BasePolicy):
         return loss
 
     def _chunks(self, observation: PyTorchObs, deterministic: bool) -> th.Tensor:
-        mean, log_std = self(observation)
+        mean, log_std = self(observation, self.actor_target if self.averaged else self.actor)
         if log_std is not None and not deterministic:
             mean = (mean + th.exp(log_std) * th.randn_like(mean)).clamp(-1, 1)
         chunks: th.Tensor = mean
@@ -199,9 +242,10 @@ class BAKUPolicy(BasePolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         del data["normalize_images"]
-        names = ("chunk", "width", "layers", "heads", "dropout", "smoothing", "random_shift")
+        names = ("chunk", "width", "layers", "heads", "dropout", "smoothing", "averaged")
         data.update({name: getattr(self, name) for name in names}, head=self.head_kind)
         data.update(
+            random_shift=self.random_shift,
             lr_schedule=self._dummy_schedule,
             features_extractor_class=self.features_extractor_class,
             features_extractor_kwargs=self.features_extractor_kwargs,
@@ -318,6 +362,7 @@ class BAKU(SafeLoad, Offline):
         self.policy.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.policy.optimizer.step()
+        average_in(self.policy.actor, self.policy.actor_target, self.num_timesteps + 1, _TAU)
         return loss.item()
 
     def _excluded_save_params(self) -> list[str]:

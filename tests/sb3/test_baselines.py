@@ -169,8 +169,31 @@ def test_baku_sees_chunks_and_repeats_the_last_action(corner):
 def test_parameter_counts_are_those_of_the_docstring():
     space = spaces.Box(0, 255, (6, 84, 84), np.uint8)
     policy = BAKUPolicy(space, spaces.Box(-1, 1, (4,)), lambda _: 1e-3)
-    count = sum(p.numel() for p in policy.parameters())
+    count = sum(p.numel() for p in policy.actor.parameters())
     assert f"{count:,}" in BAKU.__doc__
+
+
+@pytest.mark.parametrize("averaged", [True, False])
+def test_which_of_bakus_weights_act(corner, averaged):
+    demo, env = corner
+    kwargs = {**SMALL, "averaged": averaged}
+    model = BAKU("CnnPolicy", env, demo=demo, seed=0, policy_kwargs=kwargs)
+    mean = [p.detach().clone() for p in model.policy.actor.parameters()]
+    for done in range(1, 31):
+        model.learn(1, reset_num_timesteps=False)
+        share = 10 / (10 + done)
+        for average, new in zip(mean, model.policy.actor.parameters(), strict=True):
+            average.lerp_(new.detach(), share)
+    for ours, theirs in zip(model.policy.actor_target.parameters(), mean, strict=True):
+        th.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
+    policy, obs = model.policy, env.reset()
+    _, (said,) = policy.predict(obs)
+    acts, other = policy.actor_target, policy.actor
+    acts, other = (acts, other) if averaged else (other, acts)
+    with th.no_grad():
+        seen = policy.obs_to_tensor(obs)[0]
+        np.testing.assert_allclose(said[:, 0], policy(seen, acts)[0], atol=1e-6)
+        assert np.abs(said[:, 0] - policy(seen, other)[0].numpy()).max() > 1e-3
 
 
 @pytest.mark.parametrize(
