@@ -26,8 +26,9 @@ from regil_sb3.td3bc import TD3BC
 OURS: dict[str, type[TD3BC]] = {"td3bc": TD3BC, "td3bc-background": BackgroundTD3BC}
 ALGOS: dict[str, type[TD3BC] | type[BAKU]] = {**OURS, "bc": BC, "rot": ROT, "baku": BAKU}
 
+_GUIDE = "regil_wrappers.RetrievalGuideWrapper"
 RETRIEVAL = {
-    "regil_wrappers.RetrievalGuideWrapper": RetrievalGuideWrapper,
+    _GUIDE: RetrievalGuideWrapper,
     "regil_wrappers.RetrievalRewardWrapper": RetrievalRewardWrapper,
 }
 _TAKE_DEMO = {
@@ -151,13 +152,16 @@ class Settings:
         """Agent steps between two evaluations as it learns."""
         return self.eval_freq or max(min(self.steps // 6, 2_500), 1)
 
+    @property
+    def guide(self) -> dict[str, Any] | None:
+        """Arguments of the guide's wrapper; None: there is no guide."""
+        return dict(map(_named, self.env_wrapper)).get(_GUIDE)
+
     def retrieval(self, name: str) -> Any:
         """An argument that the retrieval wrappers share, such as ``encoder``."""
-        for entry in self.env_wrapper:
-            if isinstance(entry, dict) and next(iter(entry)) in RETRIEVAL:
-                arguments = next(iter(entry.values())) or {}
-                if name in arguments:
-                    return arguments[name]
+        for wrapper, arguments in map(_named, self.env_wrapper):
+            if wrapper in RETRIEVAL and name in arguments:
+                return arguments[name]
         return inspect.signature(RetrievalRewardWrapper).parameters[name].default
 
     def overridden(self, words: list[str]) -> Settings:
@@ -177,11 +181,7 @@ class Settings:
     def without_guide(self) -> Settings:
         """The same for a demonstration without actions: the reward alone, as of ``ablation-rl``."""
         settings = copy.deepcopy(self)
-        settings.env_wrapper = [
-            entry
-            for entry in settings.env_wrapper
-            if "regil_wrappers.RetrievalGuideWrapper" not in (entry, *entry)
-        ]
+        settings.env_wrapper = [e for e in settings.env_wrapper if _named(e)[0] != _GUIDE]
         for key, value in comparisons()["ablation-rl"].items():
             if self.policy == "CnnPolicy" or not key.startswith("policy_kwargs."):
                 _override(settings, key, value)
@@ -212,11 +212,7 @@ class Settings:
             ValueError: a name that is no wrapper of the packages allowed here.
         """
         out = []
-        for entry in self.env_wrapper:
-            name, arguments = (
-                next(iter(entry.items())) if isinstance(entry, dict) else (entry, None)
-            )
-            arguments = dict(arguments or {})
+        for name, arguments in map(_named, self.env_wrapper):
             if name in _TAKE_DEMO:
                 out.append((_TAKE_DEMO[name], {**arguments, "demo": demo}))
                 continue
@@ -388,6 +384,15 @@ def _is_in(module: str, run: Path) -> bool:
     return any(run in (p, *p.parents) or p in run.parents for p in places)
 
 
+def _named(entry: Any) -> tuple[str, dict[str, Any]]:
+    """A wrapper of ``env_wrapper``: its name, and the arguments that it is given."""
+    pairs = list(entry.items()) if isinstance(entry, dict) else [(entry, None)]
+    if len(pairs) != 1 or not isinstance(pairs[0][1], dict | None):
+        raise ValueError(f"env_wrapper has {entry!r}: write NAME, or NAME: {{ARGUMENT: VALUE}}")
+    name, given = pairs[0]
+    return name, dict(given or {})
+
+
 def encoder_size(settings: Settings) -> int | None:
     """Picture size that the run's encoder wants, or None if the observation's will do."""
     size: int | None = getattr(make_encoder(settings.retrieval("encoder")), "frame_size", None)
@@ -411,11 +416,9 @@ def _override(settings: Settings, key: str, value: Any) -> None:
     elif key in model:
         settings.hyperparams[key] = value
     elif key in wrappers:
-        for i, entry in enumerate(settings.env_wrapper):
-            name = next(iter(entry)) if isinstance(entry, dict) else entry
+        for i, (name, given) in enumerate(map(_named, settings.env_wrapper)):
             if name in RETRIEVAL and key in inspect.signature(RETRIEVAL[name]).parameters:
-                old = (entry[name] or {}) if isinstance(entry, dict) else {}
-                settings.env_wrapper[i] = {name: {**old, key: value}}
+                settings.env_wrapper[i] = {name: {**given, key: value}}
     else:
         near = difflib.get_close_matches(key, model | wrappers | own, n=3)
         hint = f": did you mean {' or '.join(near)}?" if near else ""

@@ -131,9 +131,7 @@ def learned(folders: Sequence[Path | str]) -> tuple[list[Learned], list[str]]:
                     settings.seed,
                     settings.steps,
                     settings.warmup_steps,
-                    json.dumps(
-                        [e for e in settings.env_wrapper if "RetrievalGuideWrapper" in str(e)]
-                    ),
+                    json.dumps(settings.guide),
                     buffer,
                     sum(outcomes),
                     len(outcomes),

@@ -22,7 +22,7 @@ import regil_sb3  # registers the environments  # noqa: F401
 from regil_sb3.bench.cells import kind_of
 from regil_sb3.envs import METAWORLD_TASKS
 from regil_sb3.recording import check_seeds, record_expert
-from regil_sb3.settings import make_settings, presets
+from regil_sb3.settings import make_settings
 
 __all__ = [
     "TASKS",
@@ -55,8 +55,7 @@ def guides() -> dict[str, dict[str, Any]]:
     (``register``), "corrected" is the default preset's.
     """
     plain, corrected = (
-        dict(presets()[name]["env_wrapper"][0]["regil_wrappers.RetrievalGuideWrapper"])
-        for name in ("plain", "default")
+        make_settings(env_id(TASKS[0]), name).guide or {} for name in ("plain", "default")
     )
     return {"plain": plain, "moved back": {**plain, "register": True}, "corrected": corrected}
 

@@ -58,7 +58,7 @@ def test_runs_that_say_too_little_are_left_out(tmp_path):
     names = ("good", "unguided", "short", "running", "unregularised")
     found, left_out = learned([tmp_path / name for name in names])
     good = str(tmp_path / "good")
-    assert found == [Learned(good, "hammer", "default", 4, 15_000, 2_000, "[]", 100, 19, 20)]
+    assert found == [Learned(good, "hammer", "default", 4, 15_000, 2_000, "null", 100, 19, 20)]
     assert [line.rpartition(": ")[2].split(" (")[0] for line in left_out] == [
         "no guide acted in it",
         "its log does not reach the end of the warm-up",

@@ -410,6 +410,7 @@ def test_a_demonstration_without_actions(words, tmp_path, capsys):
     assert "the demonstration has no actions: no guide" in capsys.readouterr().err
     settings = Settings.load(run / "config.yaml")
     assert [w.__name__ for w, _ in settings.wrappers("d")] == ["RetrievalRewardWrapper"]
+    assert settings.guide is None
     assert (settings.hyperparams["bc_coef"], settings.warmup_steps) == (0, 0)
     assert settings.hyperparams["policy_kwargs"]["shared_encoder"]  # or nothing would train it
     assert any(row["eval/success_rate"] for row in rows(run))
@@ -442,3 +443,10 @@ def test_missing_demonstration_names_what_to_do(tmp_path, monkeypatch, capsys):
     assert "no scripted expert" in error
     assert "`regil record`" in error
     assert "--demo" in error
+
+
+@pytest.mark.parametrize("entry", [{}, {"a.B": {}, "a.C": {}}, {"a.B": "register"}])
+def test_a_wrapper_that_cannot_be_read_gets_one_line(entry):
+    settings = Settings("toy_registered:regil/ToyReach-v0", env_wrapper=[entry])
+    with pytest.raises(ValueError, match=r"write NAME, or NAME: \{"):
+        settings.wrappers("demo.hdf5")
