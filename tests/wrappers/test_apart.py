@@ -76,6 +76,13 @@ def test_one_of_them_stands() -> None:
     assert register_apart(scene(), scene(), taken()) == Apart(None, None)
 
 
+def test_what_the_cup_covers_has_not_moved() -> None:
+    rng = np.random.default_rng(0)
+    for cup in rng.integers(-16, 17, (12, 2)):
+        moved = register_apart(scene(), scene(cup), taken())
+        assert moved.place is None, cup
+
+
 def test_another_light_and_noise() -> None:
     noise = np.random.default_rng(0).normal(0, 4, (SIZE, SIZE, 3))
     seen = (scene((6, -3), (-7, 4)) * 0.85 + noise).clip(0, 255).astype(np.uint8)

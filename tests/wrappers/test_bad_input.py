@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import gymnasium as gym
@@ -44,6 +45,7 @@ def test_another_image_size(demo_path: str) -> None:
         ("camera", "beside", "recorded with camera 'above' but the environment has 'beside'"),
         ("render", {"shadows": True}, "recorded with render {'shadows': False} but"),
         ("action_repeat", 2, "recorded with action_repeat 1 but the environment has 2"),
+        ("render", {"light": (1, 2)}, "recorded with render {'shadows': False} but"),
     ],
 )
 def test_other_settings_than_recorded(demo_path: str, name: str, value: Any, message: str) -> None:
@@ -83,6 +85,26 @@ def test_mirrored_objects_on_an_even_background_are_no_turned_picture() -> None:
     frame[10:40, 10:30] = (200, 40, 40)
     for turned in (frame[::-1], frame[:, ::-1], frame[::-1, ::-1]):
         check_upright(np.ascontiguousarray(turned), frame, "demo")
+
+
+def test_settings_are_compared_as_a_file_gives_them_back(demo: Demonstration) -> None:
+    env = ToyReach()
+    env.metadata["regil"]["render"] = {"light": (1.0, 0.5), "at": np.zeros(2)}
+    as_read = {"light": [1.0, 0.5], "at": [0.0, 0.0]}
+    RetrievalRewardWrapper(
+        env, dataclasses.replace(demo, metadata={**demo.metadata, "render": as_read})
+    )
+
+
+def test_things_that_change_places_are_no_exchanged_colours() -> None:
+    def scene(red: int, blue: int) -> Any:
+        frame = np.full((84, 84, 3), (170, 130, 90), np.uint8)  # a wooden table
+        frame[30:50, red : red + 20] = (220, 30, 30)
+        frame[30:50, blue : blue + 20] = (30, 30, 220)
+        return frame
+
+    check_upright(scene(50, 10), scene(10, 50), "demo")
+    refused(lambda: check_upright(scene(10, 50)[..., ::-1], scene(10, 50), "demo"), "red and blue")
 
 
 def test_another_scene_is_no_turned_picture() -> None:

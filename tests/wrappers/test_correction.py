@@ -13,6 +13,7 @@ import toy_camera
 from regil_wrappers import Demonstration, RetrievalGuideWrapper, calibration
 from regil_wrappers.correction import Servo
 from regil_wrappers.pinhole import Pinhole, fit_pinhole
+from regil_wrappers.registration import Displacement
 from toy_camera import HOME, ToyCamera
 
 
@@ -548,3 +549,34 @@ def test_limits_that_differ_by_direction(known: dict[str, Any]) -> None:
         np.testing.assert_allclose(servo._hand, hand, atol=1e-6)
     servo.executed(np.ones(4, np.float32), action, picture)  # clipped by the environment
     np.testing.assert_allclose(servo._hand, hand + high[:3], atol=1e-6)
+
+
+def test_actions_that_are_no_numbers_or_beyond_the_limits(known: dict[str, Any]) -> None:
+    ones, picture = np.ones(7, np.float32), np.zeros((84, 84, 3), np.uint8)
+    servo = Servo((84, 84), np.zeros((8, 7), np.float32), -ones, ones, gripper_dim=6,
+                  rotation_dims=[3, 4, 5])  # fmt: skip
+    suggested = np.zeros(7, np.float32)
+    servo.reset()  # calibration moves
+    servo.executed(suggested * np.nan, suggested, picture)
+    assert servo.kind != "calibration"  # somebody else acts
+    servo.load_state({**known, "gripper_dim": 6})
+    servo.reset(kind="corrected")
+    servo.executed(5 * ones, 5 * ones, picture)
+    np.testing.assert_array_equal(servo._turned, np.ones(3))
+    servo.executed(suggested * np.nan, suggested, picture)
+    np.testing.assert_array_equal(servo._turned, np.ones(3))
+    np.testing.assert_array_equal(servo._hand, np.ones(3))
+    assert not servo._followed
+
+
+def test_what_moved_apart_is_looked_for_where_it_is_of_use(known: dict[str, Any]) -> None:
+    actions = np.zeros((60, 4), np.float32)
+    actions[:, 0], actions[:20, 3], actions[20:, 3] = 0.3, -1, 1
+    ones = np.ones(4, np.float32)
+    servo = Servo((84, 84), actions, -ones, ones)
+    assert servo.grasp == 20
+    assert servo.grasp_to_look_at(None) is None  # no camera: it replays plainly
+    servo.load_state(known)
+    found = Displacement((40.0, 40.0), (3.0, 0.0), 1.0, 0.2, 0.1, (0.0, 0.0))
+    assert servo.grasp_to_look_at(found) == servo.grasp_to_look_at(None) == 20
+    assert servo.grasp_to_look_at(replace(found, changed=0.4)) is None

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import toy_env  # registers ToyReach-v0  # noqa: F401
-from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper
+from regil_wrappers import Demonstration, RetrievalGuideWrapper, RetrievalRewardWrapper, vector
 from regil_wrappers.reward_signals import AT_EPISODE_END, AT_EVERY_STEP
 from regil_wrappers.rewards import episode_scale, ot_rewards, tot_rewards
 from toy_env import ToyReach
@@ -99,3 +99,23 @@ def test_a_specification_remembers_the_reward(demo_path: str, reward: Any) -> No
 def test_an_unknown_reward_gets_one_line(demo: Demonstration) -> None:
     with pytest.raises(ValueError, match=r"^reward='dtw': choose one of \['sdtw', 'progress'"):
         RetrievalRewardWrapper(ToyReach(), demo, reward="dtw")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("inside", "outside"), [("ot", "tot"), ("ot", "sdtw"), ("sdtw", "ot")])
+def test_rewards_at_the_end_are_not_stacked(inside: Any, outside: Any, demo: Demonstration) -> None:
+    env = RetrievalGuideWrapper(RetrievalRewardWrapper(ToyReach(), demo, reward=inside), demo)
+    message = "come at an episode's end and cannot be stacked"
+    with pytest.raises(ValueError, match=message):
+        RetrievalRewardWrapper(env, demo, reward=outside, mode="add")
+    envs: Any = gym.vector.SyncVectorEnv([ToyReach] * 2)
+    envs = vector.RetrievalRewardWrapper(envs, demo, reward=inside)
+    with pytest.raises(ValueError, match=message):
+        vector.RetrievalRewardWrapper(envs, demo, reward=outside, mode="add")
+
+
+def test_rewards_at_every_step_are_stacked(demo: Demonstration) -> None:
+    inside = RetrievalRewardWrapper(ToyReach(), demo, reward="cos")
+    env = RetrievalRewardWrapper(inside, demo, reward="sdtw", mode="add", weight=2.0)
+    env.reset(seed=0)
+    *_, info = env.step(np.zeros(2, np.float32))
+    assert info["retrieval"]["cost"] >= 0

@@ -244,9 +244,10 @@ def test_an_encoder_may_want_larger_pictures() -> None:
     larger = toy_env.record(encoder_size=64)
     assert larger.actions is not None
     encoder = Larger()
-    steps = play(RetrievalRewardWrapper(ToyReach(), larger, encoder), larger.actions)
-    assert encoder.shapes == {(64, 64, 3)}  # the size that was recorded
-    assert all(step[1] == 0 for step in steps[1:])
+    for obs in ("pixels", "channels_first"):
+        steps = play(RetrievalRewardWrapper(ToyReach(obs=obs), larger, encoder), larger.actions)
+        assert encoder.shapes == {(64, 64, 3)}  # the size that was recorded
+        assert all(step[1] == 0 for step in steps[1:])
 
     for demo, env in (
         (toy_env.record(), ToyReach()),

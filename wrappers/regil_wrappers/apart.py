@@ -162,7 +162,9 @@ def register_apart(
             fits[i] = _Fit(centre, *found)
     explained = _explained(pair, own, rest, fits)
     taken_one, place = (_displacement(pair, fit, m) for fit, m in zip(fits, explained, strict=True))
-    if place is not None and not _stands_alone(place, explained[1], own, pair.unit):
+    before, after = explained[1]
+    covered = _arrived(own, fits[0], pair.unit)
+    if place is not None and not _stands_alone(place, (before * ~covered, after), own, pair.unit):
         place = None
     return Apart(taken_one, place)
 
@@ -183,6 +185,14 @@ def _stands_alone(
     ys, xs = np.nonzero(own)
     away = np.hypot(xs - place.point[0], ys - place.point[1])
     return not len(away) or float(away.min()) > _ASIDE * unit
+
+
+def _arrived(own: Floats, fit: _Fit | None, unit: float) -> Mask:
+    """Where what is taken up has gone: what it covers there has not moved."""
+    if fit is None:
+        return np.zeros(own.shape, bool)
+    _, there = both_ways(own, own, fit.centre, fit.shift, fit.growth)
+    return np.asarray(cv2.dilate((there > 0.3).astype(np.uint8), square(5, unit)) > 0)
 
 
 def _widened(mask: Floats, unit: float) -> Floats:

@@ -146,6 +146,11 @@ class Servo:
         """The step in which the demonstration's open gripper closes; None where none does."""
         return self._path.grasp
 
+    def grasp_to_look_at(self, found: Displacement | None) -> int | None:
+        """`grasp`, where `reset` has a use for ``apart`` beside this displacement; else None."""
+        scene_is_another = found is not None and found.changed > _ELSEWHERE
+        return self.grasp if self.cameras and not scene_is_another else None
+
     @property
     def hand_pixel(self) -> Floats | None:
         """(2,) px, where the hand starts; None where it always starts there, or is not known."""
@@ -244,14 +249,17 @@ class Servo:
     ) -> None:
         """What was done, whoever chose it, what the guide had suggested, and what was seen then.
 
-        A replay may be disturbed by noise; calibration moves may not.
+        A replay may be disturbed by noise; calibration moves may not. What is beyond the limits
+        counts as clipped to them, and a number that is none as no move, by somebody else.
         """
         full = np.maximum((self._high - self._low) / 2, 1e-9)
+        action = np.clip(action, self._low, self._high)
         off = float((np.abs(action - suggested) / full).max())
+        action = np.nan_to_num(action)
         self._followed = self._followed and off <= _DISTURBED
         if self._moving and self._calibration is not None:
             self._calibrated_here = True
-            if off > 1e-3:  # somebody else acts: no calibration in this episode
+            if not off <= 1e-3:  # somebody else acts: no calibration in this episode
                 self._moving = False
                 return
             self._calibration.step(picture)

@@ -34,7 +34,7 @@ from regil_wrappers.retrieval_wrapper import (
     make_retriever,
     said_of,
 )
-from regil_wrappers.reward_signals import Signal, check_reward, make_signal
+from regil_wrappers.reward_signals import Signal, check_inside, check_reward, make_signal
 from regil_wrappers.rewards import episode_scale
 
 __all__ = ["Episodes", "Guides", "Rewards", "Several"]
@@ -59,6 +59,8 @@ class Several:
         resets_at_once: whether an environment begins its next episode in the step that ends one.
         inside: the episodes of a retrieval wrapper further in, which are shared; None: there is
             none.
+        late: whether the reward of a wrapper further in comes at an episode's end; None: there is
+            none.
     """
 
     n: int
@@ -71,6 +73,7 @@ class Several:
     has: Callable[[str], bool]
     resets_at_once: bool
     inside: Episodes | None
+    late: bool | None = None
 
     @property
     def unwrapped(self) -> Several:
@@ -293,6 +296,7 @@ class Rewards:
     ) -> None:
         demos, frames = several.checked(settings)
         check_reward(reward, mode, weight, divisor, settings["search"])
+        check_inside(reward, several.late)
         self.episodes = _episodes(several, demos, settings, frames)
         self._adds = mode == "add"
         self._weight = weight

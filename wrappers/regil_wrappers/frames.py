@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Mapping
 from typing import Any, Protocol, cast
 
@@ -35,8 +36,8 @@ AS_RECORDED = ("camera", "render", "action_repeat")
 
 # A first frame counts as turned when most of a 28 x 28 picture differs from the demonstration's (by
 # more than _DIFFERENT of 255 in some channel) and turning it leaves less than half of that. Objects
-# at other places change fewer pixels than _TURNED; exchanged colours cannot come from an object
-# that moved, so _SWAPPED is smaller.
+# at other places change fewer pixels than _TURNED. Exchanged colours show wherever there is colour,
+# of which there may be little: _SWAPPED is smaller, but most coloured pixels must have changed.
 _DIFFERENT = 25
 _TURNED = 0.25
 _SWAPPED = 0.05
@@ -143,7 +144,7 @@ class FrameSource:
     @property
     def hand_starts_elsewhere(self) -> bool:
         """Whether the environment says that its hand does not start in one place."""
-        return bool(stated(self._env.unwrapped.metadata).get("start_std"))
+        return stated(self._env.unwrapped.metadata).get("start_std") is not None
 
     def use_encoder_frames(self) -> bool:
         """Take the environment's larger pictures from now on, where there are such.
@@ -158,6 +159,7 @@ class FrameSource:
             return False
         self._check_last(f"{self._label} holds {larger.shape[1]}-pixel encoder_frames")
         self._encoder_size = larger.shape[1]
+        self._channels_first = False  # observations may be; these are (H, W, 3)
         return True
 
     def _check_last(self, why: str) -> None:
@@ -268,11 +270,16 @@ def check_recorded_settings(env: Asked, metadata: dict[str, Any], label: str) ->
     here = stated(env.unwrapped.metadata)
     for name in AS_RECORDED:
         recorded = metadata[name]
-        if recorded not in (None, {}) and here.get(name, recorded) != recorded:
+        if recorded not in (None, {}) and _as_json(here.get(name, recorded)) != _as_json(recorded):
             raise ValueError(
                 f"{label} was recorded with {name} {recorded!r} but the environment has "
                 f"{here[name]!r}: make the environment with the recorded one, or record again"
             )
+
+
+def _as_json(value: Any) -> Any:
+    """As a file would give it back: what was recorded has been in one."""
+    return json.loads(json.dumps(value, default=lambda one: np.asarray(one).tolist()))
 
 
 def check_size(size: tuple[int, ...], recorded: tuple[int, ...], label: str) -> None:
@@ -306,9 +313,11 @@ def check_upright(frame: NDArray[np.uint8], recorded: NDArray[np.uint8], label: 
         for picture in (frame, recorded)
     )
 
-    def changed(picture: NDArray[np.int16]) -> float:
-        return float((np.abs(picture - there).max(axis=2) > _DIFFERENT).mean())
+    def changed(picture: NDArray[np.int16], among: Any = ...) -> float:
+        return float((np.abs(picture - there).max(axis=2) > _DIFFERENT)[among].mean())
 
+    coloured = np.abs(there[..., 0] - there[..., 2]) > _DIFFERENT
+    swaps = coloured.any() and changed(here, coloured) > 0.5
     turned = {
         "upside down": here[::-1],
         "mirrored": here[:, ::-1],
@@ -319,7 +328,7 @@ def check_upright(frame: NDArray[np.uint8], recorded: NDArray[np.uint8], label: 
         for name, picture in turned.items()
     }
     for least, variants in (
-        (_SWAPPED, {"with red and blue exchanged": here[..., ::-1]}),
+        (_SWAPPED, {"with red and blue exchanged": here[..., ::-1] if swaps else here}),
         (_TURNED, turned | swapped),
     ):
         name, picture = min(variants.items(), key=lambda variant: changed(variant[1]))

@@ -79,9 +79,10 @@ class Guide:
             if not self.servo.calibrated:
                 self.servo.reset()
                 return
-            grasp, hand = self.servo.grasp, self.servo.hand_pixel
+            found = displacement() if self.servo.cameras else None
+            grasp, hand = self.servo.grasp_to_look_at(found), self.servo.hand_pixel
             self.servo.reset(
-                displacement(),
+                found,
                 None if grasp is None else apart(grasp, self.servo.near),
                 hand=None if hand is None else shift_at(hand),
             )

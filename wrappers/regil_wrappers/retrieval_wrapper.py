@@ -104,7 +104,7 @@ class RetrievalWrapper(gym.Wrapper[ObsType, ActType, ObsType, ActType]):
     def displacement(self) -> Displacement | None:
         """What moved between the demonstration's first picture and this episode's; None: nothing.
 
-        Found when it is first asked for in an episode (about 0.1 s).
+        Found when it is first asked for in an episode (about 0.1 s at 84x84, longer by its pixels).
         """
         if self._frames is None:
             return cast("Displacement | None", self.env.get_wrapper_attr("displacement"))

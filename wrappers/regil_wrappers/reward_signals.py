@@ -25,6 +25,7 @@ __all__ = [
     "AT_EPISODE_END",
     "AT_EVERY_STEP",
     "Signal",
+    "check_inside",
     "check_reward",
     "check_search",
     "make_signal",
@@ -220,6 +221,24 @@ def check_reward(reward: str, mode: str, weight: float, divisor: str, search: st
             raise ValueError(f"{name}={value!r}: choose one of {list(choices)}")
     if not isinstance(weight, (int, float)) or not math.isfinite(weight):
         raise ValueError(f"weight={weight!r}: it must be a finite number")
+
+
+def check_inside(reward: str, late: bool | None) -> None:
+    """Refuse a reward over another one where either comes at an episode's end.
+
+    Args:
+        reward: of the wrapper outside.
+        late: whether that of a reward wrapper inside comes at an episode's end; None: there is
+            none.
+
+    Raises:
+        ValueError: naming what would be right.
+    """
+    if late or (late is not None and reward in AT_EPISODE_END):
+        raise ValueError(
+            f"reward={reward!r} over another reward wrapper: {', '.join(AT_EPISODE_END)} come at "
+            "an episode's end and cannot be stacked with others: take the other wrapper away"
+        )
 
 
 def make_signal(name: str, retriever: Retriever, horizon: int | None = None) -> Signal:

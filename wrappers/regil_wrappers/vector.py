@@ -391,9 +391,11 @@ def _several(env: VectorEnv[Any, Any, Array]) -> Several:
             f"metadata['autoreset_mode'] of {env} is {mode!r}: it must say one of "
             "gymnasium.vector.AutoresetMode, or alignments would go on from one episode to the next"
         )
-    inside: VectorEnv[Any, Any, Array] = env
-    while isinstance(inside, VectorWrapper) and not isinstance(inside, _RetrievalWrapper):
-        inside = inside.env
+    stack = [env]
+    while isinstance(stack[-1], VectorWrapper):
+        stack.append(stack[-1].env)
+    ours = [one for one in stack if isinstance(one, _RetrievalWrapper)]
+    late = [one.rewards_at_episode_end for one in ours if isinstance(one, RetrievalRewardWrapper)]
     base: Any = env.unwrapped
     return Several(
         n=env.num_envs,
@@ -405,5 +407,6 @@ def _several(env: VectorEnv[Any, Any, Array]) -> Several:
         call=lambda name, *given: base.call(name, *given),
         has=lambda name: hasattr(base, "call") and all(base.call("has_wrapper_attr", name)),
         resets_at_once=mode == AutoresetMode.SAME_STEP,
-        inside=inside._episodes if isinstance(inside, _RetrievalWrapper) else None,
+        inside=ours[0]._episodes if ours else None,
+        late=late[0] if late else None,
     )

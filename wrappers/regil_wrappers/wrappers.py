@@ -26,7 +26,12 @@ from regil_wrappers.guide import Guide
 from regil_wrappers.guide_arguments import check_guide, fitting_actions, make_servo, warn_of_rate
 from regil_wrappers.memory import Search
 from regil_wrappers.retrieval_wrapper import RetrievalWrapper, checked, settings_of
-from regil_wrappers.reward_signals import AT_EPISODE_END, check_reward, make_signal
+from regil_wrappers.reward_signals import (
+    AT_EPISODE_END,
+    check_inside,
+    check_reward,
+    make_signal,
+)
 from regil_wrappers.rewards import episode_scale
 
 __all__ = ["RetrievalGuideWrapper", "RetrievalRewardWrapper"]
@@ -346,6 +351,8 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         )
         loaded, frames = checked(env, settings)
         check_reward(reward, mode, weight, divisor, search)
+        late = "rewards_at_episode_end"
+        check_inside(reward, env.get_wrapper_attr(late) if env.has_wrapper_attr(late) else None)
 
         gym.utils.RecordConstructorArgs.__init__(
             self,
@@ -370,7 +377,7 @@ class RetrievalRewardWrapper(RetrievalWrapper[ObsType, ActType], gym.utils.Recor
         """What makes a typical step's reward about 1 in size, from the demonstration alone.
 
         1 / tau for "sdtw", 1 / 5 for "pwil", 1 for "progress", "cos" and "orca"; for "ot" and "tot"
-        frames / 10, once they are times ``episode_scale``.
+        frames / 10, once they are times ``episode_scale``. ``weight`` is left out: it is to tell.
 
         Raises:
             ValueError: if the demonstration does not move.
