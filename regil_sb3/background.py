@@ -13,17 +13,17 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-import torch as th
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from regil_sb3.policies import copy_tensors
 from regil_sb3.td3bc import TD3BC
 
 __all__ = ["BackgroundTD3BC", "at_rest", "paused"]
@@ -159,6 +159,20 @@ class BackgroundTD3BC(TD3BC):
                 self._turn.wait_for(lambda: self.pretrained or self._failure is not None)
             self._raise_failure()
 
+    def pretrain_bc(
+        self, steps: int, progress: Callable[[int], None] | None = None, before: int = 0
+    ) -> float:
+        """As `TD3BC.pretrain_bc`; in the learner's thread it ends where `learn` is left."""
+
+        def go_on(done: int) -> None:
+            if self._ends:
+                raise RuntimeError(f"learn was left after {done} of {steps} updates by cloning")
+            if progress is not None:
+                progress(done)
+
+        its_own = threading.current_thread() is self._learner
+        return super().pretrain_bc(steps, go_on if its_own else progress, before)
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """The learner rests between two updates and all transitions are in the replay buffer.
@@ -249,9 +263,8 @@ class BackgroundTD3BC(TD3BC):
     def _hand_over(self) -> None:
         """Let a copy of the policy act that is as new as can be."""
         spare = self._copies[self._copies[0] is self._acting]
-        with th.no_grad():
-            for old, new in zip(spare.parameters(), self.policy.parameters(), strict=True):
-                old.copy_(new)
+        copy_tensors(self.policy.parameters(), spare.parameters())
+        copy_tensors(self.policy.buffers(), spare.buffers())
         self._acting = spare
 
     def _excluded_save_params(self) -> list[str]:

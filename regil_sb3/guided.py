@@ -31,7 +31,7 @@ def guide_actions(env: VecEnv, indices: Array, name: str = "guide_action") -> Ar
         name: the method that is asked: "guide_action" or "disturbed_action".
     """
     assert isinstance(env.action_space, spaces.Box)
-    said = np.stack(env.env_method(name, indices=indices.tolist()))
+    said = np.stack(env.env_method(name, indices=indices.tolist())).astype(env.action_space.dtype)
     return said.clip(env.action_space.low, env.action_space.high, out=said)
 
 

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch as th
@@ -166,7 +167,7 @@ _ENCODERS: dict[str, type[BaseFeaturesExtractor]] = {
     "conv": ConvEncoder,
     "resnet18": ResNet18Encoder,
 }
-_OWN = tuple(_ENCODERS.values())
+OWN_ENCODERS = tuple(_ENCODERS.values())
 
 
 def encoder_class(name: str | type[BaseFeaturesExtractor]) -> type[BaseFeaturesExtractor]:
@@ -197,7 +198,8 @@ def average_in(actor: nn.Module, average: nn.Module, updates: int, tau: float) -
     """Take an actor's weights into their running average after an update by cloning alone.
 
     The average spans about the last tenth of the updates done, and 1 / ``tau`` at most, so that
-    little of the weights it began with is left early on.
+    little of the weights it began with is left early on. Buffers (a BatchNorm's statistics) are
+    copied.
 
     Args:
         actor: as it is now.
@@ -207,6 +209,14 @@ def average_in(actor: nn.Module, average: nn.Module, updates: int, tau: float) -
     """
     share = max(tau, _AVERAGED / (updates + _AVERAGED))
     polyak_update(actor.parameters(), average.parameters(), share)
+    copy_tensors(actor.buffers(), average.buffers())
+
+
+def copy_tensors(of: Iterable[th.Tensor], to: Iterable[th.Tensor]) -> None:
+    """Copy values, one after the other, in place."""
+    with th.no_grad():
+        for new, old in zip(of, to, strict=True):
+            old.copy_(new)
 
 
 class ImagePolicy(TD3Policy):
@@ -277,7 +287,7 @@ class ImagePolicy(TD3Policy):
         for network in (self.actor, self.critic):
             for name, module in network.named_children():
                 # an extractor class of the user's own may come with weights of its own
-                if name != "features_extractor" or self.features_extractor_class in _OWN:
+                if name != "features_extractor" or self.features_extractor_class in OWN_ENCODERS:
                     module.apply(orthogonal)
         if self.shared_encoder:
             # The critic keeps gradients through the encoder, and its optimizer steps it.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from io import BufferedIOBase
 from os import PathLike
 from pathlib import Path
@@ -35,6 +36,7 @@ from torch.nn import functional as F  # noqa: N812
 from regil_sb3.arguments import check_action_space, check_arguments
 from regil_sb3.as_seen import as_seen
 from regil_sb3.bc_schedule import BySuccess, by_time
+from regil_sb3.callbacks import close_callbacks
 from regil_sb3.collection import Collection
 from regil_sb3.guided import guide_actions
 from regil_sb3.model_file import SafeLoad
@@ -188,6 +190,7 @@ class TD3BC(SafeLoad, TD3):
         check_arguments(locals())
         check_action_space("TD3BC", env)
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
+        train_freq = train_freq if isinstance(train_freq, int) else tuple(train_freq)  # type: ignore[assignment]
         self.warmup_steps, self.guide_again = warmup_steps, guide_again
         self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps
         self.bc_schedule = bc_schedule
@@ -242,6 +245,11 @@ class TD3BC(SafeLoad, TD3):
             raise ValueError(
                 f"{self.policy_class.__name__} does not fit the observations {space}: use {right}"
             )
+        if self.policy_kwargs.get("share_features_extractor"):
+            raise ValueError(
+                "policy_kwargs.share_features_extractor=True trains the encoder by the actor's "
+                "loss alone: leave it out (CnnPolicy has shared_encoder)"
+            )
         if isinstance(self.demo, str | PathLike):  # as load(..., demo=PATH) hands it over
             self.demo = Demonstration.load(self.demo)
         if self.env is not None:  # without one, what was saved with the model holds
@@ -271,26 +279,33 @@ class TD3BC(SafeLoad, TD3):
             if is_image_space(space) or self.n_steps > 1:
                 own |= {"n_steps": self.n_steps, "gamma": self.gamma}
             # TD3's set-up would warn that n_steps is ignored for a class of one's own
-            self.replay_buffer = buffer(  # type: ignore[assignment]
-                self.buffer_size,
-                space,
-                self.action_space,
-                self.device,
-                self.n_envs,
-                **(own | self.replay_buffer_kwargs),
-            )
+            with _that_fits():
+                self.replay_buffer = buffer(  # type: ignore[assignment]
+                    self.buffer_size,
+                    space,
+                    self.action_space,
+                    self.device,
+                    self.n_envs,
+                    **(own | self.replay_buffer_kwargs),
+                )
         self.success_buffer = SuccessBuffer(
             self.success_buffer_size, self.n_stack if is_image_space(space) else 1
         )
         if self.demo is not None and self.demo.actions is not None:
             self._add_demonstration(self.demo)
-        super()._setup_model()
-        self.replay_buffer_class = chosen
+        given = dict(self.replay_buffer_kwargs)
+        with _that_fits():
+            super()._setup_model()
+        # What set-up added would be saved, and hold against what `load` replaces
+        self.replay_buffer_class, self.replay_buffer_kwargs = chosen, given
+        self._by_success.floor = self.bc_floor
         self._returns: dict[str, list[float]] = {}
         assert self.action_space.shape is not None
         self._collection = Collection(self.n_envs, self.action_space.shape, self.keep_own_successes)
 
     def _check_demo(self) -> None:
+        if not isinstance(self.demo, Demonstration | None):
+            raise ValueError(f"demo is {self.demo!r:.60}: it takes one Demonstration, or its file")
         if self.bc_coef == 0:
             return
         if self.demo is None:
@@ -346,6 +361,7 @@ class TD3BC(SafeLoad, TD3):
         )
         if reset_num_timesteps:
             self.pretrained = False
+            self._by_success = BySuccess(self.bc_floor)
         if begins_anew:  # the environments were reset, whatever they were doing
             self._collection.restart(self.num_timesteps < self.warmup_steps)
             if isinstance(self.replay_buffer, FrameReplayBuffer):
@@ -369,8 +385,8 @@ class TD3BC(SafeLoad, TD3):
         assert self.env is not None
         guided = self._collection.guided
         if guided.all():
-            action = np.zeros((n_envs, *self.action_space.shape), np.float32)
-            buffer_action = action.copy()
+            action = np.zeros((n_envs, *self.action_space.shape), self.action_space.dtype)
+            buffer_action = action.astype(np.float32)
         else:
             action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
             if self.exploration_std > 0 and action_noise is None:
@@ -691,8 +707,8 @@ class TD3BC(SafeLoad, TD3):
                 reset_num_timesteps=reset_num_timesteps,
                 progress_bar=progress_bar,
             )
-        finally:  # Stable-Baselines3 tells callbacks of the end only where no error was raised
-            _close(callback)
+        finally:
+            close_callbacks(callback)
 
     # -- the replay buffer on disk ---------------------------------------------------------------
 
@@ -754,6 +770,17 @@ class TD3BC(SafeLoad, TD3):
         ]
 
 
+@contextmanager
+def _that_fits() -> Iterator[None]:
+    """SB3's buffers warn of too little memory, and let the machine run out of it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*enough memory to store the complete")
+        try:
+            yield
+        except UserWarning as warning:
+            raise MemoryError(f"{str(warning).strip()}: set buffer_size lower") from None
+
+
 def encode(network: Any, preprocessed: Any) -> th.Tensor:
     """Features (B, F) of an actor or a critic of SB3's."""
     features: th.Tensor = network.features_extractor(preprocessed)
@@ -764,12 +791,3 @@ def q_values(critic: Any, features: th.Tensor, actions: th.Tensor) -> tuple[th.T
     """Q of every critic, (B, 1) each."""
     inputs = th.cat([features, actions], dim=1)
     return tuple(q(inputs) for q in critic.q_networks)
-
-
-def _close(callback: MaybeCallback) -> None:
-    """Close a callback, and those in it, that can be."""
-    for inner in callback if isinstance(callback, list) else getattr(callback, "callbacks", []):
-        _close(inner)
-    close = getattr(callback, "close", None)
-    if close is not None:
-        close()

@@ -321,7 +321,7 @@ def _several(venv: VecEnv) -> Several:
             f"{venv!r} is no VecEnv of Stable-Baselines3: regil_wrappers has the same wrappers for "
             "one environment, and regil_wrappers.vector for Gymnasium's vector environments"
         )
-    inside = venv
+    inside, late = venv, "rewards_at_episode_end"
     while isinstance(inside, VecEnvWrapper) and not isinstance(inside, _VecRetrieval):
         inside = inside.venv
     return Several(
@@ -335,4 +335,5 @@ def _several(venv: VecEnv) -> Several:
         has=venv.has_attr,
         resets_at_once=True,
         inside=inside._episodes if isinstance(inside, _VecRetrieval) else None,
+        late=any(venv.get_attr(late)) if venv.has_attr(late) else None,
     )

@@ -28,7 +28,13 @@ from regil_sb3.arguments import check_action_space, check_device, check_number
 from regil_sb3.as_seen import as_seen
 from regil_sb3.baselines.offline import Offline
 from regil_sb3.model_file import SafeLoad
-from regil_sb3.policies import average_in, encoder_class, orthogonal, random_shift
+from regil_sb3.policies import (
+    OWN_ENCODERS,
+    average_in,
+    encoder_class,
+    orthogonal,
+    random_shift,
+)
 
 _LOG_STD = (-3.0, 1.0)  # limits of the Gaussian head's
 _TAU = 0.005  # TD3's own: how fast the average follows the weights
@@ -61,7 +67,8 @@ class BAKUNetwork(nn.Module):
         self.chunk, self.actions, self.gaussian = chunk, actions, gaussian
         width = features_extractor.features_dim
         self.features_extractor = features_extractor
-        self.features_extractor.apply(orthogonal)
+        if type(features_extractor) in OWN_ENCODERS:  # another may come with weights of its own
+            features_extractor.apply(orthogonal)
         self.action_token = nn.Parameter(0.02 * th.randn(1, 1, width))
         self.positions = nn.Parameter(0.02 * th.randn(1, 2, width))
         layer = nn.TransformerEncoderLayer(
@@ -337,6 +344,8 @@ class BAKU(SafeLoad, Offline):
         ).to(self.device)
         if self.demo is None or self.env is None:
             return  # a model that was loaded to act
+        if isinstance(self.demo, str | PathLike):  # as load(..., demo=PATH) hands it over
+            self.demo = Demonstration.load(self.demo)
         stacking = unwrap_vec_wrapper(self.env, VecFrameStack)
         n_stack = stacking.stacked_obs.n_stack if isinstance(stacking, VecFrameStack) else 1
         seen, actions = as_seen(self.demo, self.observation_space, self.action_space, n_stack)
@@ -347,6 +356,8 @@ class BAKU(SafeLoad, Offline):
 
     def update(self) -> float:
         """One update; see ``Offline.update``."""
+        if self.demo is None:
+            raise ValueError("BAKU needs demo= to learn: a demonstration with actions, or its file")
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         drawn = np.random.randint(0, len(self._seen), size=self.batch_size)

@@ -24,4 +24,5 @@ class BC(Offline, TD3BC):
 
     def update(self) -> float:
         """One update of the actor; see ``Offline.update``."""
+        self._update_learning_rate(self.actor.optimizer)
         return self.pretrain_bc(1, before=self.num_timesteps)

@@ -8,6 +8,8 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 
+from regil_sb3.callbacks import close_callbacks
+
 SelfOffline = TypeVar("SelfOffline", bound="Offline")
 
 
@@ -34,7 +36,28 @@ class Offline(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfOffline:
-        """Make ``total_timesteps`` updates, and log the mean loss every ``log_interval``."""
+        """Make ``total_timesteps`` updates, and log the mean loss every ``log_interval``.
+
+        However it ends, callbacks that have a ``close`` are closed.
+        """
+        try:
+            self._learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps,
+                progress_bar,
+            )  # fmt: skip
+        finally:
+            close_callbacks(callback)
+        return self
+
+    def _learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback,
+        log_interval: int,
+        tb_log_name: str,
+        reset_num_timesteps: bool,
+        progress_bar: bool,
+    ) -> None:
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -52,7 +75,6 @@ class Offline(BaseAlgorithm):
             if not callback.on_step():
                 break
         callback.on_training_end()
-        return self
 
     def dump_logs(self) -> None:
         """Write log data."""

@@ -18,6 +18,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
+from regil_sb3.baselines.offline import Offline
 from regil_sb3.checkpoint.snapshot import Ring
 from regil_sb3.relabelling import (
     EpisodeRewardDictReplayBuffer,
@@ -61,6 +62,11 @@ def check_can_be_kept(model: TD3BC) -> None:
     Raises:
         ValueError: naming it.
     """
+    if isinstance(model, Offline):
+        raise ValueError(
+            f"a checkpoint cannot hold a {type(model).__name__}, which makes no steps: leave it "
+            "out, and save the model"
+        )
     if model.get_vec_normalize_env() is not None:
         raise ValueError("a checkpoint holds no VecNormalize: leave it out")
     noise = model.action_noise

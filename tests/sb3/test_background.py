@@ -169,6 +169,31 @@ def test_a_failure_of_the_learner_ends_learning(demo, monkeypatch):
         made(demo).learn(5_000)
 
 
+def test_who_leaves_does_not_wait_for_the_updates_by_cloning(demo, monkeypatch):
+    made_so_far = []
+    pays = TD3BC._bc_term
+
+    def bc_term(self):
+        made_so_far.append(1)
+        time.sleep(0.01)
+        return pays(self)
+
+    monkeypatch.setattr(TD3BC, "_bc_term", bc_term)
+    model = made(demo, warmup_steps=10, bc_pretrain_steps=10**6)
+    main_thread = threading.main_thread().ident
+
+    def interrupt():
+        while len(made_so_far) < 5:
+            time.sleep(0.01)
+        signal.pthread_kill(main_thread, signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(100)
+    assert 5 <= len(made_so_far) < 10**4
+    assert not model.pretrained
+
+
 class StoppedError(Exception):
     """Before the evaluation."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from contextlib import closing
 from dataclasses import replace
 
@@ -27,6 +28,7 @@ from regil_sb3.baselines import (
     vinn_act,
 )
 from regil_sb3.baselines.baku import BAKUPolicy
+from regil_sb3.checkpoint import CheckpointCallback
 from regil_sb3.cli import main
 from regil_sb3.evaluation import evaluate, policy_act
 from regil_sb3.recording import record_expert
@@ -194,6 +196,55 @@ def test_which_of_bakus_weights_act(corner, averaged):
         seen = policy.obs_to_tensor(obs)[0]
         np.testing.assert_allclose(said[:, 0], policy(seen, acts)[0], atol=1e-6)
         assert np.abs(said[:, 0] - policy(seen, other)[0].numpy()).max() > 1e-3
+
+
+class Constant(th.nn.Flatten):
+    """An encoder that comes with weights of its own."""
+
+    def __init__(self, observation_space, features_dim):
+        super().__init__()
+        self.features_dim = features_dim
+        self.own = th.nn.Linear(int(np.prod(observation_space.shape)), features_dim)
+        th.nn.init.constant_(self.own.weight, 0.5)
+
+    def forward(self, images):
+        return self.own(super().forward(images))
+
+
+def test_baku_leaves_the_weights_of_an_encoder_of_ones_own(corner):
+    demo, env = corner
+    kwargs = {**SMALL, "features_extractor_class": Constant}
+    model = BAKU("CnnPolicy", env, demo=demo, policy_kwargs=kwargs)
+    assert (model.policy.actor.features_extractor.own.weight == 0.5).all()
+
+
+def test_baku_goes_on_only_with_its_demonstration(corner, tmp_path):
+    demo, env = corner
+    BAKU("CnnPolicy", env, demo=demo, policy_kwargs=SMALL).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="needs demo= to learn"):
+        BAKU.load(tmp_path / "model", env=env).learn(2)
+    demo.save(tmp_path / "demo.hdf5")
+    again = BAKU.load(tmp_path / "model", env=env, demo=str(tmp_path / "demo.hdf5"))
+    assert again.learn(2).num_timesteps == 2
+
+
+@pytest.mark.parametrize("algorithm", [BC, BAKU])
+def test_learning_rates_that_fall(corner, algorithm):
+    demo, env = corner
+    own = {"policy_kwargs": SMALL} if algorithm is BAKU else {"warmup_steps": 0, "buffer_size": 1}
+    model = algorithm("CnnPolicy", env, demo=demo, learning_rate=lambda left: 1e-3 * left, **own)
+    model.learn(20)
+    optimizer = model.policy.optimizer if algorithm is BAKU else model.actor.optimizer
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 / 20)
+
+
+def test_bc_keeps_no_checkpoints_and_leaves_signals_as_they_were(corner, tmp_path):
+    demo, env = corner
+    before = signal.getsignal(signal.SIGINT)
+    model = BC("CnnPolicy", env, demo=demo, warmup_steps=0, buffer_size=1)
+    with pytest.raises(ValueError, match="a checkpoint cannot hold a BC, which makes no steps"):
+        model.learn(5, CheckpointCallback(tmp_path))
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize(

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import io
 import pickle
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from regil_wrappers import Demonstration
 from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 from toy import Reach, demonstration, stacked
 
@@ -467,6 +470,7 @@ def test_subprocesses_and_dict_observations():
         ({"reward_scale": "automatic"}, "reward_scale is 'automatic'"),
         ({"policy_kwargs": {"share_features_extractor": True}}, "shared_encoder"),
         ({"policy_kwargs": {"features_extractor_class": "vgg"}}, "conv, resnet18"),
+        ({"demo": [demonstration()]}, "it takes one Demonstration, or its file"),
     ],
 )
 def test_bad_arguments(kwargs, message):
@@ -494,9 +498,18 @@ def test_bad_combinations():
         TD3BC("MultiInputPolicy", DummyVecEnv([lambda: Reach(dict_obs=True)]), demo=demo)
     with pytest.raises(ValueError, match="observations="):
         TD3BC("MultiInputPolicy", DummyVecEnv([lambda: Reach(dict_obs=True)]), demo=demo, n_steps=1)
+    with pytest.raises(ValueError, match="by the actor's loss alone"):
+        TD3BC("MlpPolicy", "Pendulum-v1", policy_kwargs={"share_features_extractor": True}, **OFF)
     pendulum = TD3BC("MlpPolicy", "Pendulum-v1", **TD3_OWN, **{**OFF, "warmup_steps": 10})
     with pytest.raises(ValueError, match="needs a guide"):
         pendulum.learn(20)
+
+
+def test_vectors_that_would_not_fit_into_memory(monkeypatch):
+    left = SimpleNamespace(available=10**5)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: left)
+    with pytest.raises(MemoryError, match=r"enough memory .*: set buffer_size lower"):
+        TD3BC("MlpPolicy", "Pendulum-v1", **TD3_OWN, **OFF)
 
 
 def test_a_disturbed_guide_is_executed_and_the_undisturbed_cloned(monkeypatch):
@@ -609,3 +622,68 @@ def test_q_comes_in_as_the_bc_term_falls():
     assert (model.bc_coef_now(), model.q_coef_now()) == (0.5, 0.375)
     by_time = small(stacked(), bc_coef=2.0, q_coef=0.5)
     assert by_time.q_coef_now() == 0.5
+
+
+def test_attributes_replaced_at_load_replace_what_set_up_made_of_them(tmp_path):
+    env = stacked()
+    small(env, bc_schedule="success").save(tmp_path / "model")
+    changed = {"gamma": 0.9, "n_steps": 1, "bc_floor": 0.1}
+    loaded = TD3BC.load(tmp_path / "model", env=env, demo=demonstration(), **changed)
+    assert (loaded.replay_buffer.gamma, loaded.replay_buffer.n_steps) == (0.9, 1)
+    assert loaded._by_success.floor == 0.1
+    vectors = {**TD3_OWN, **OFF, "n_steps": 3}
+    TD3BC("MlpPolicy", "Pendulum-v1", **vectors).save(tmp_path / "vectors")
+    TD3BC.load(tmp_path / "vectors", env=gym.make("Pendulum-v1"), n_steps=1).learn(110)
+
+
+def test_learning_anew_begins_at_the_whole_of_lambda():
+    model = small(stacked(), bc_schedule="success", warmup_steps=20, bc_pretrain_steps=200)
+    model.learn(400)
+    assert model.bc_coef_now() < model.bc_coef
+    model.learn(2)
+    assert (model.bc_coef_now(), model.q_coef_now()) == (model.bc_coef, 0.0)
+
+
+def test_a_guide_at_the_bounds_of_a_float64_space(monkeypatch):
+    def guide_action(self):
+        return np.array([-0.1, 0.1], np.float32)  # float32(0.1) is above 0.1
+
+    monkeypatch.setattr(Reach, "guide_action", guide_action)
+    env = Reach()
+    env.action_space = spaces.Box(-0.1, 0.1, (2,), np.float64)
+    model = small(VecFrameStack(DummyVecEnv([lambda: env]), 2), bc_coef=0.0, demo=None)
+    seen, step = [], env.step
+
+    def noted(action):
+        seen.append(action)
+        return step(action)
+
+    monkeypatch.setattr(env, "step", noted)
+    model.learn(30)
+    assert len(seen) == 30
+    assert all(env.action_space.contains(action) for action in seen)
+
+
+class Normalised(BaseFeaturesExtractor):
+    """An encoder with BatchNorm."""
+
+    def __init__(self, observation_space, features_dim=16):
+        super().__init__(observation_space, features_dim)
+        pixels = int(np.prod(observation_space.shape))
+        self.net = th.nn.Sequential(
+            th.nn.Flatten(), th.nn.Linear(pixels, features_dim), th.nn.BatchNorm1d(features_dim)
+        )
+
+    def forward(self, observations):
+        return self.net(observations)
+
+
+def test_the_average_has_the_statistics_of_a_batch_norm():
+    kwargs = {"features_extractor_class": Normalised, "shared_encoder": False}
+    model = small(stacked(), policy_kwargs=kwargs)
+    model.set_logger(Logger(None, []))
+    model.pretrain_bc(20)
+    of, to = (a.features_extractor.net[2] for a in (model.actor, model.actor_target))
+    assert of.running_var.ne(1).any()
+    th.testing.assert_close(to.running_mean, of.running_mean)
+    th.testing.assert_close(to.running_var, of.running_var)
