@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from regil_wrappers import Demonstration, RetrievalRewardWrapper
 from regil_wrappers.conditions import camera_shift, match_colours
 from regil_wrappers.registration import (
     Displacement,
@@ -15,6 +17,7 @@ from regil_wrappers.registration import (
     register,
     shift_since,
 )
+from toy_env import ToyReach
 
 SIZE = 84
 HOME = np.array([40.0, 44.0])  # px, where the thing stands in the first picture
@@ -267,3 +270,19 @@ def test_light_and_camera_shift_nothing_round_a_point(
         point = HOME + np.array(camera) + np.array(moved) / 2
         found = shift_since(scene(), second, point)
         np.testing.assert_allclose(found, moved, atol=0.4 if any(moved) else 0.2)
+
+
+def test_another_scene_is_not_moved_back(demo: Demonstration) -> None:
+    one, two = (textured(SIZE, seed).astype(np.uint8) for seed in (1, 2))
+    found = register(one, two)
+    assert found is not None
+    assert found.another_scene
+    np.testing.assert_array_equal(moved_back(two, found), two)
+    noise = np.random.default_rng(0).integers(0, 256, demo.frames.shape, np.uint8)
+    other = Demonstration(noise, demo.actions, metadata=demo.metadata)
+    env = RetrievalRewardWrapper(ToyReach(), other, register=True)
+    with pytest.warns(UserWarning, match="pictures are not moved back"):
+        env.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.reset(seed=1)  # said once

@@ -39,7 +39,6 @@ _WORST_RATIO = 0.95  # a registration that explains less is not believed
 _KICK_EVERY = 10  # steps of a disturbed episode, on average
 _DISTURBED = 0.5  # of a full action: a replay that was disturbed by no more is a replay
 _MISFIT = 4.0  # std: a displacement that fits picture and plane worse is not believed
-_ELSEWHERE = 0.35  # of the picture: where more has changed, it is not one thing that moved
 _OFTEN = 3  # episodes in which that happens before it is said
 
 
@@ -148,8 +147,8 @@ class Servo:
 
     def grasp_to_look_at(self, found: Displacement | None) -> int | None:
         """`grasp`, where `reset` has a use for ``apart`` beside this displacement; else None."""
-        scene_is_another = found is not None and found.changed > _ELSEWHERE
-        return self.grasp if self.cameras and not scene_is_another else None
+        elsewhere = found is not None and found.another_scene
+        return self.grasp if self.cameras and not elsewhere else None
 
     @property
     def hand_pixel(self) -> Floats | None:
@@ -414,7 +413,7 @@ class Servo:
             self._hand, _ = solve_displacement(camera, np.zeros(3), hand, None, self._start_std)
         if found is None:
             return
-        if found.changed > _ELSEWHERE:
+        if found.another_scene:
             self._way = self._ways.plain
             if not self.why:
                 self._say(

@@ -39,7 +39,7 @@ class Episode:
         self.retriever = retriever
         self.frames = frames
         self._moves_back = moves_back
-        self._said_camera = False
+        self._said: set[str] = set()
         self._taken: NDArray[np.bool_] | None = None
         self._arms: dict[int, NDArray[np.bool_]] = {}  # by the step of the grasp
         self.begin()
@@ -92,15 +92,25 @@ class Episode:
             first = self.frames.recorded_first
             self._displacement = found = register(first, self._first, self._without_arm)
             self._registered = True
-            if found is not None and any(found.camera) and not self._said_camera:
-                self._said_camera = True
+            if found is not None and any(found.camera):
                 x, y = found.camera
-                warnings.warn(
-                    f"the camera has moved since the demonstration: what stands still is shifted "
-                    f"by ({x:.1f}, {y:.1f}) pixels, which is taken out",
-                    stacklevel=2,
+                self._say_once(
+                    "the camera has moved since the demonstration",
+                    f"what stands still is shifted by ({x:.1f}, {y:.1f}) pixels, which is taken "
+                    "out",
+                )
+            if found is not None and found.another_scene and self._moves_back:
+                self._say_once(
+                    "camera or scene are others than the demonstration's",
+                    f"{found.changed:.0%} of the picture differ; pictures are not moved back "
+                    "(register) while that lasts",
                 )
         return self._displacement
+
+    def _say_once(self, what: str, how: str) -> None:
+        if what not in self._said:
+            self._said.add(what)
+            warnings.warn(f"{what}: {how}", stacklevel=3)
 
     def apart(self, grasp: int, near: tuple[Point, Point] | None = None) -> Apart:
         """How far what the demonstration takes up has moved, and what else; found anew each time.

@@ -47,6 +47,7 @@ _COARSE = 42  # side of the pictures of the coarse search
 _REACH = 14  # how far it looks, in pixels of these
 _PULL = 0.51  # error (of 255) that a pixel of coarse shift must save
 _GROWTHS = (0.88, 1.0, 1.12)
+_ELSEWHERE = 0.35  # of the picture: where more has changed, it is not one thing that moved
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,11 @@ class Displacement:
     ratio: float
     changed: float = 0.0
     camera: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def another_scene(self) -> bool:
+        """Whether so much of the picture has changed that it is not one thing that moved."""
+        return self.changed > _ELSEWHERE
 
 
 def register(
@@ -147,12 +153,12 @@ def moved_back(picture: Picture, displacement: Displacement | None) -> Picture:
 
     Args:
         picture: (H, W, 3) uint8, like the second picture of `register`.
-        displacement: what `register` found; None changes nothing.
+        displacement: what `register` found; None, or one of another scene, changes nothing.
 
     Returns:
         (H, W, 3) uint8; the border repeats.
     """
-    if displacement is None:
+    if displacement is None or displacement.another_scene:
         return picture
     x, y = np.add(displacement.shift, displacement.camera)
     return warped(picture, moved_by((x, y)), inverse=True)
