@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, SupportsFloat
 
+import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
@@ -90,6 +91,31 @@ def policy_act(model: BaseAlgorithm) -> Act:
 def guide_act(obs: Any, env: VecEnv, first: bool) -> npt.NDArray[Any]:
     """Guided replay: what ``RetrievalGuideWrapper`` suggests, corrected where it corrects."""
     return np.stack(env.env_method("guide_action"))
+
+
+class ResetWhenAsked(gym.Wrapper[Any, Any, Any, Any]):
+    """For what exists once: SB3 resets an environment where its episode ends, and again for a seed.
+
+    Of these two the first, which is given no seed, returns the last observation: nobody has to put
+    a scene back for an episode that is not played.
+    """
+
+    _last: Any = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset, unless an episode has just ended and no seed is given."""
+        last, self._last = self._last, None
+        if seed is None and last is not None:
+            return last, {}
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step."""
+        observation, reward, terminated, truncated, info = super().step(action)
+        self._last = observation if terminated or truncated else None
+        return observation, reward, terminated, truncated, info
 
 
 def evaluate(

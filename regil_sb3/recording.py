@@ -18,7 +18,7 @@ import numpy.typing as npt
 from regil_wrappers.demonstration import Demonstration
 from regil_wrappers.frames import stated
 
-from regil_sb3.envs import EVALUATION_SEEDS
+from regil_sb3.envs import EVALUATION_SEEDS, NoExpertError
 
 __all__ = [
     "EVALUATION_SEEDS",
@@ -31,10 +31,6 @@ __all__ = [
 ]
 
 _PACKAGES = ("gymnasium", "metaworld", "mujoco", "numpy", "regil-sb3", "regil-wrappers")
-
-
-class NoExpertError(ValueError):
-    """An environment has no scripted expert."""
 
 
 def record_expert(

@@ -38,6 +38,7 @@ from regil_sb3.evaluation import (
     SELECTION_SEED,
     Act,
     Evaluation,
+    ResetWhenAsked,
     evaluate,
     guide_act,
     policy_act,
@@ -69,13 +70,16 @@ Learner = TD3BC | BAKU
 BC_UPDATES = 5_000  # of the "BC" that tables compare with: the demonstration alone
 
 
-def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEnv:
+def make_env(
+    settings: Settings, demo: Path, n_envs: int | None = None, evaluates: bool = False
+) -> VecEnv:
     """The environment of a run, as SB3 wants it.
 
     Args:
         settings: of the run.
         demo: the demonstration's file, given to the retrieval wrappers.
         n_envs: instead of the run's own number.
+        evaluates: whether it is for `evaluate` alone: `ResetWhenAsked`.
 
     Raises:
         ValueError: the environment, its arguments or the demonstration do not fit.
@@ -90,7 +94,9 @@ def make_env(settings: Settings, demo: Path, n_envs: int | None = None) -> VecEn
             raise ValueError(f"{settings.env} exists once: n_envs is {n_envs}, take 1")
         for wrapper, arguments in wrappers:
             env = wrapper(env, **arguments)
-        return env if once else ReplayableEpisode(env)
+        if once:
+            return ResetWhenAsked(env) if evaluates else env
+        return ReplayableEpisode(env)
 
     try:
         env: VecEnv = make_vec_env(
@@ -448,7 +454,7 @@ def evaluate_run(
             filmed = result
 
     # One after the other: of a robot there are not two
-    with closing(make_env(settings, run / "demo.hdf5", n_envs=1)) as env:
+    with closing(make_env(settings, run / "demo.hdf5", 1, evaluates=True)) as env:
         algorithm = ALGOS[settings.algo]
         model = algorithm.load(run / "model.zip", trust=trust, buffer_size=1)
         offline = isinstance(model, Offline)
@@ -463,7 +469,7 @@ def evaluate_run(
         if not offline and "bc" in only and demo.actions is not None:
             play("bc", policy_act(_bc_model(settings, demo, env, run, trust)), env)
     if not {"guide", "vinn"}.isdisjoint(only):
-        with closing(make_env(settings.plain(), run / "demo.hdf5", n_envs=1)) as env:
+        with closing(make_env(settings.plain(), run / "demo.hdf5", 1, evaluates=True)) as env:
             if env.has_attr("guide_action"):
                 play("guide", guide_act, env)
             if offline and env.has_attr("retriever"):

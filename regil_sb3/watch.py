@@ -180,7 +180,7 @@ class Watch(BaseCallback):
             self._low = min(self._low, float(values.min()))
             self._high = max(self._high, float(values.max()))
             self._episodes += bool(done)
-        if self._episodes == self.episodes and self._high - self._low <= 1e-9 * abs(self._high):
+        if self._episodes >= self.episodes and self._high - self._low <= 1e-9 * abs(self._high):
             self._say(
                 "reward",
                 f"the retrieval reward was {self._high:g} at every step of {self._episodes} "

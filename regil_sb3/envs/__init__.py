@@ -17,9 +17,15 @@ __all__ = [
     "REHEARSAL_TASKS",
     "ROBOSUITE_ROBOTS",
     "ROBOSUITE_TASKS",
+    "NoExpertError",
     "exists_once",
     "register_envs",
 ]
+
+
+class NoExpertError(ValueError):
+    """An environment has no scripted expert."""
+
 
 EVALUATION_SEEDS = 1_000_000
 """Seeds from here on belong to evaluation: a demonstration must not know what it is tested on."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from regil_sb3.envs import NoExpertError
 from regil_sb3.envs.libero_tasks import LIBERO_TASKS
 from regil_sb3.envs.osc_experts import CAREFUL, EXACT, Action, Arm, Floats, above
 
@@ -33,12 +34,12 @@ def make_expert(task: str, env: Any) -> Iterator[Action]:
         (7,) float32 actions, as many as are asked for.
 
     Raises:
-        ValueError: where the task has none.
+        NoExpertError: where the task has none.
     """
     for short, expert in _EXPERTS.items():
         if LIBERO_TASKS[task] == LIBERO_TASKS[short]:
             return expert(Arm(env, env.obj_body_id))
-    raise ValueError(
+    raise NoExpertError(
         f"regil/libero-{task}-v0 has no scripted expert: those are {', '.join(_EXPERTS)}; "
         "`regil convert` takes LIBERO's public demonstrations"
     )

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from regil_sb3.envs import NoExpertError
 from regil_sb3.envs.osc_experts import CAREFUL, EXACT, Action, Arm, Floats, above
 
 __all__ = ["make_expert"]
@@ -32,10 +33,10 @@ def make_expert(task: str, env: Any) -> Iterator[Action]:
         (7,) float32 actions, as many as are asked for.
 
     Raises:
-        ValueError: where the task has none.
+        NoExpertError: where the task has none.
     """
     if task not in _EXPERTS:
-        raise ValueError(
+        raise NoExpertError(
             f"robosuite's {task} has no scripted expert: those are {', '.join(_EXPERTS)}; "
             "`regil convert` takes robomimic's demonstrations"
         )

@@ -20,7 +20,16 @@ import numpy.typing as npt
 from gymnasium.spaces import Box
 
 from regil_sb3.robots.episodes import EpisodeWriter
-from regil_sb3.robots.interfaces import Arm, ArmState, Camera, Clock, Picture, RealClock, RobotError
+from regil_sb3.robots.interfaces import (
+    Arm,
+    ArmState,
+    Camera,
+    Clock,
+    Picture,
+    RealClock,
+    RobotError,
+    first_line,
+)
 from regil_sb3.robots.limits import Limits, Patience
 from regil_sb3.robots.timing import StepTimes
 
@@ -47,6 +56,9 @@ class Operator(Protocol):
 
     def ready(self, message: str) -> None:
         """Say what is to be done, and wait until it is."""
+
+    def close(self) -> None:
+        """No more is asked: the environment is closed."""
 
 
 class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
@@ -81,7 +93,7 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
             counts, too.
         reset_scene: puts the scene back, once the hand is home; asks the operator where there is
             one and this is None.
-        operator: a person at the keyboard.
+        operator: a person at the keyboard; closed with the environment.
         start_noise: (3,) m, the hand starts up to so far from home, drawn anew each episode.
         closed: whether an episode starts with a closed gripper.
         rate: control steps a second.
@@ -225,6 +237,8 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         self._target = self._arm.state().position.copy()
         self._steps, self._same = 0, 0
         self._rests = True
+        if self._operator is not None:
+            self._operator.succeeded()  # a key that came too late is not this episode's
         frame = self._observation()
         if self._writer is not None:
             self._writer.begin(frame)
@@ -306,6 +320,9 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
             if self._writer is not None:
                 rest.callback(self._writer.close)
                 rest.callback(self._end_episode, "closed")
+            # Keys that two listen to reach one of them
+            if self._operator is not None and hasattr(self._operator, "close"):
+                rest.callback(self._operator.close)
             rest.callback(self._camera.close)
             rest.callback(self._give_arm_back)
             rest.callback(self._end_watch)
@@ -391,8 +408,8 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
             )
         if self.fault is not None:
             return False
-        seen = self._success is not None and self._success(picture, state)
-        return seen or (self._operator is not None and self._operator.succeeded())
+        pressed = self._operator is not None and self._operator.succeeded()
+        return pressed or (self._success is not None and bool(self._success(picture, state)))
 
     def _watch(self) -> None:
         """Stop the arm where something is wrong; called all the time, from anywhere."""
@@ -401,8 +418,8 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
                 return
             try:
                 why = self._what_is_wrong()
-            except RobotError as error:
-                why = str(error)
+            except Exception as error:  # whatever a driver raises: nobody watches without this
+                why = first_line(error)
             if why is not None:
                 self._stop(why)
 
@@ -427,8 +444,9 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         with self._lock:
             try:
                 self._arm.stop()
-            except RobotError as error:
-                why = f"{why} ({error})" if str(error) != why else why
+            except Exception as error:  # see above
+                said = first_line(error)
+                why = f"{why} ({said})" if said != why else why
             if self.fault is not None:
                 return
             self.fault, self._due = why, np.inf
@@ -501,7 +519,8 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
 
     def _put_back(self, start: npt.NDArray[np.float64]) -> None:
         """Bring the hand to its start, above all that stands about, and the scene back."""
-        self._go(self._arm.state().position * (1, 1, 0) + (0, 0, self._home[2]), self._closed)
+        above = self._arm.state().position * (1, 1, 0) + (0, 0, self._home[2])
+        self._go(np.clip(above, self.limits.low, self.limits.high), self._closed)
         self._go(self._home, self._closed)
         if self._reset_scene is not None:
             self._reset_scene()
@@ -514,6 +533,7 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         self._target = self._arm.state().position.copy()
         end = self._clock.now() + _HOMING
         while np.linalg.norm(self._arm.state().position - place) > _REACHED:
+            end += self._hold_while_operator_pauses()
             with self._lock:
                 self._require_no_fault()
                 self._move(place, closed)
@@ -524,10 +544,19 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
 
     def _hold_while_paused(self) -> None:
         """Wait while the program or the operator has paused."""
-        if self._operator is not None and self._operator.paused() and not self._paused:
-            self.pause()
-            while self._operator.paused() and self.fault is None:
-                self._clock.sleep_until(self._clock.now() + self._period)
-            self.resume()
+        self._hold_while_operator_pauses()
         while self._paused and self.fault is None:
             self._clock.sleep_until(self._clock.now() + self._period)
+
+    def _hold_while_operator_pauses(self) -> float:
+        """Returns how long (s) that was."""
+        began = self._clock.now()
+        if self._operator is None or not self._operator.paused() or self._paused:
+            return 0.0
+        self.pause()
+        while self._operator.paused() and self.fault is None:
+            self._clock.sleep_until(self._clock.now() + self._period)
+        self.resume()
+        with contextlib.suppress(RobotError):  # the watchdog says so
+            self._target = self._arm.state().position.copy()
+        return self._clock.now() - began

@@ -57,7 +57,8 @@ class FrankaArm:
         self._robot.relative_dynamics_factor = dynamics
         self._force = force
         self._lock = threading.Lock()
-        self._held, self._closed = False, False
+        self._held = False
+        self._closed: bool | None = None  # not known: the first move says it
         self._direction = self._robot.current_pose.end_effector_pose.quaternion
         self._ends = False
         self._clock: Any = None  # the robot's own
@@ -132,7 +133,7 @@ class FrankaArm:
         pose = self._robot.current_pose.end_effector_pose
         return ArmState(
             np.array(pose.translation, float).reshape(3),
-            self._closed,
+            bool(self._closed),
             time.monotonic() if fresh or before is None else before.time,
             f"it is in error: {state.current_errors}" if self._robot.has_errors else None,
         )

@@ -20,6 +20,8 @@ from regil_sb3.robots.interfaces import Picture, RobotError, first_line
 
 __all__ = ["GrabbingCamera", "OpenCVCamera", "RealSenseCamera"]
 
+_FROZEN = 3  # times that a picture comes again: no sensor's does
+
 
 class GrabbingCamera:
     """Keeps the newest picture; subclasses open, grab (which may wait) and release."""
@@ -32,6 +34,7 @@ class GrabbingCamera:
 
     def _start(self) -> None:
         self._picture, self._error, self._ends = None, None, False
+        self._repeats = 0
         self._open()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -47,12 +50,12 @@ class GrabbingCamera:
         return self._picture
 
     def recover(self) -> None:
-        """Open it again, if it is gone.
+        """Open it again, if it is gone, or repeats one picture.
 
         Raises:
             RobotError: it cannot be opened.
         """
-        if self._error is not None or not self._thread.is_alive():
+        if self._error is not None or not self._thread.is_alive() or self._repeats >= _FROZEN:
             self.close()
             try:
                 self._start()
@@ -74,7 +77,9 @@ class GrabbingCamera:
             except Exception as error:  # see above
                 self._error = f"camera {self.name}: {first_line(error)}"
                 return
-            self._picture = Picture(image, time.monotonic())
+            before, self._picture = self._picture, Picture(image, time.monotonic())
+            same = before is not None and np.array_equal(before.image, image)
+            self._repeats = self._repeats + 1 if same else 0
 
     def _wrong_size(self, height: int, width: int) -> ValueError:
         return ValueError(

@@ -20,9 +20,9 @@ class Limits:
         delta: how far an action of 1 moves the hand along an axis (m).
         speed: of the hand at most (m/s).
         lead: how far a place that is asked for may be from where the hand is, along each axis (m):
-            an arm that is held back by what it touches pushes no harder than that. It comes after
-            the box: a hand that was pushed out of it is brought back gradually, and until then
-            places that are asked for may lie outside, too.
+            an arm that is held back by what it touches pushes no harder than that. A hand that was
+            pushed out of the box is brought back at this speed, and until then places that are
+            asked for may lie outside, too.
 
     Raises:
         ValueError: the box is empty, or a number is not positive.
@@ -57,12 +57,11 @@ class Limits:
             position: (3,) where the hand is.
             seconds: until the next.
         """
-        step = wanted - target
+        step = np.clip(wanted, self.low, self.high) - target
         length = float(np.linalg.norm(step))
         most = self.speed * seconds
         asked = target + step * min(1.0, most / max(length, 1e-12))
-        inside = np.clip(asked, self.low, self.high)
-        return np.clip(inside, position - self.lead, position + self.lead)
+        return np.clip(asked, position - self.lead, position + self.lead)
 
 
 @dataclass(frozen=True)

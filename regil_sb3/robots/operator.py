@@ -62,6 +62,8 @@ class Keyboard:
 
     def close(self) -> None:
         """Give the terminal back as it was."""
+        if self._ends:
+            return
         self._ends = True
         self._thread.join()
         termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)

@@ -74,6 +74,7 @@ class Rehearsal:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "regil_sb3.robots.rehearsal_server", *map(str, words)],
             pass_fds=[there.fileno()],
+            start_new_session=True,  # a terminal's Ctrl-C is the program's; the socket's end is its
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         )
         there.close()

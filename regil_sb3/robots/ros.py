@@ -181,7 +181,8 @@ class RosArm:
         self._gripper, self._gripper_type = gripper, gripper_type
         self._gripper_data = gripper_data
         self._lock = threading.Lock()
-        self._held, self._closed = False, False
+        self._held = False
+        self._closed: bool | None = None  # not known: the first move says it
         self._message: Any = None
         self._arrived = 0.0
         first = self._connect()
@@ -193,7 +194,7 @@ class RosArm:
         if self._bridge.error is not None:
             raise RobotError(f"arm: {self._bridge.error}")
         message, arrived = self._message, self._arrived
-        return ArmState(_position(message), self._closed, arrived)
+        return ArmState(_position(message), bool(self._closed), arrived)
 
     def move(self, position: npt.NDArray[np.float64], closed: bool) -> None:
         """Send the pose to follow and, where it changes, the gripper's command."""

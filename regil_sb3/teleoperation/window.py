@@ -93,7 +93,10 @@ class Window:
 
     def sees(self, recorder: Recorder) -> npt.NDArray[np.uint8]:
         """The scene as it is now, larger where the environment draws it so."""
-        return recorder.drawn(_PICTURE)
+        try:
+            return recorder.drawn(_PICTURE)
+        except ValueError:  # a camera whose pictures are smaller
+            return recorder.frames[-1]
 
     def wait(self, words: str) -> None:
         """Say what takes a while."""

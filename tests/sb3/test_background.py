@@ -203,6 +203,7 @@ class Robot(toy_env.ToyReach):
 
     open_ones = 0
     steps_of_all = 0
+    put_back = 0
 
     def __init__(self, **settings):
         if Robot.open_ones:
@@ -210,6 +211,10 @@ class Robot(toy_env.ToyReach):
         super().__init__(**settings)
         Robot.open_ones += 1
         self.metadata["regil"]["exists_once"] = True
+
+    def reset(self, *, seed=None, options=None):
+        Robot.put_back += 1
+        return super().reset(seed=seed, options=options)
 
     def step(self, action):
         Robot.steps_of_all += 1
@@ -247,7 +252,11 @@ def test_a_robot_is_opened_once_at_a_time(robot, tmp_path, capsys):
     assert "eval/success_rate" not in logged[-1]
     assert "from regil_sb3.background import BackgroundTD3BC\n" in (run / "README.md").read_text()
     assert main(["report", str(run)]) == 0
-    assert main(["evaluate", str(run), "--episodes", "1"]) == 0
+    Robot.put_back = 0
+    assert main(["evaluate", str(run), "--episodes", "3"]) == 0
+    found = json.loads((run / "evaluation.json").read_text())
+    played = sum(found[name]["episodes"] for name in METHODS if name in found)
+    assert Robot.put_back == played  # the scene, once for each
 
 
 def test_several_of_a_robot_are_refused(robot, capsys):

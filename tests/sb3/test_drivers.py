@@ -74,7 +74,7 @@ def test_a_camera_that_opencv_opens(film):
 class FailingCamera(GrabbingCamera):
     """Grabs until it is to fail; counts how often it was opened."""
 
-    opened, failure = 0, None
+    opened, failure, frozen = 0, None, False
 
     def _open(self):
         self.opened += 1
@@ -85,7 +85,9 @@ class FailingCamera(GrabbingCamera):
         time.sleep(0.005)
         if self.failure is not None:
             raise self.failure
-        return CAMERA
+        if not self.frozen:  # a sensor's noise
+            self.picture = np.roll(CAMERA, np.random.default_rng().integers(1, 99), axis=1)
+        return self.picture
 
     def _release(self):
         pass
@@ -102,7 +104,7 @@ def test_a_camera_is_gone_whatever_its_library_raises():
         camera.recover()
     camera.failure = None
     camera.recover()
-    assert waited(camera.read).image is CAMERA
+    assert waited(camera.read)
     opened = camera.opened
     camera.recover()  # it works: nothing to do
     assert camera.opened == opened
@@ -111,6 +113,10 @@ def test_a_camera_is_gone_whatever_its_library_raises():
     camera.recover()
     assert camera.opened == opened + 1
     assert waited(camera.read)
+    camera.frozen = True  # it repeats one picture
+    waited(lambda: camera._repeats > 5)
+    camera.recover()
+    assert camera.opened == opened + 2
     camera.close()
 
 
@@ -191,6 +197,7 @@ def test_an_operator_at_a_terminal():
     waited(answered)
     assert not keys.aborted()
     keys.close()
+    keys.close()  # once is enough
     os.close(ours)
     os.close(theirs)
 
@@ -306,17 +313,18 @@ def test_an_arm_of_ros(robot):
     arm.move(np.array([0.41, 0.02, 0.25]), True)
     waited(lambda: np.allclose(arm.state().position, [0.41, 0.02, 0.25]))
     assert arm.state().closed
+    arm.move(np.array([0.41, 0.02, 0.25]), True)  # it is closed already
     arm.stop()
     arm.move(np.array([0.0, 0.0, 0.0]), False)  # does not count
-    waited(lambda: sum(said["op"] == "publish" for said in robot.received) == 3)
+    waited(lambda: sum(said["op"] == "publish" for said in robot.received) == 4)
     said = [(s["topic"], s["msg"]) for s in robot.received if s["op"] == "publish"]
-    assert [topic for topic, _ in said] == ["/go", "/grip", "/go"]
+    assert [topic for topic, _ in said] == ["/go", "/grip", "/go", "/go"]
     assert said[1][1] == {"data": True}
-    assert said[2][1]["pose"] == {
+    assert said[3][1]["pose"] == {
         "position": {"x": 0.41, "y": 0.02, "z": 0.25},
         "orientation": DOWN,
     }
-    assert said[2][1]["header"]["frame_id"] == "base"
+    assert said[3][1]["header"]["frame_id"] == "base"
     robot.moves = False  # the driver repeats itself: its state is as old as its stamp
     time.sleep(0.1)
     old = arm.state().time
@@ -334,6 +342,17 @@ def test_an_arm_of_ros(robot):
     arm.recover()
     arm.move(np.array([0.42, 0.0, 0.3]), False)
     waited(lambda: np.allclose(arm.state().position, [0.42, 0.0, 0.3]))
+    arm.close()
+
+
+def test_a_gripper_is_told_what_to_be_at_first(robot):
+    """A program that was killed may have left it closed."""
+    arm = RosArm("/hand", "/go", "/grip", address=robot.address)
+    assert not arm.state().closed
+    arm.move(np.array([0.4, 0.0, 0.3]), False)
+    waited(lambda: sum(said["op"] == "publish" for said in robot.received) == 2)
+    (grip,) = [s["msg"] for s in robot.received if s.get("msg") and s["topic"] == "/grip"]
+    assert grip == {"data": False}
     arm.close()
 
 

@@ -33,7 +33,7 @@ class Operator:
     """A person who does what the test says."""
 
     def __init__(self):
-        self.stop = self.hold = self.success = False
+        self.stop = self.hold = self.success = self.closed = False
         self.asked = []
 
     def succeeded(self):
@@ -48,6 +48,9 @@ class Operator:
     def ready(self, message):
         self.asked.append(message)
         self.stop = False
+
+    def close(self):
+        self.closed = True
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +138,9 @@ def test_limits():
     )
     edge = np.array([0.99, 0.5, 0.5])
     assert limits.next_target(edge, edge + np.array([0.02, 0, 0]), edge, 0.1)[0] == 1.0
+    outside = np.array([0.5, 1.3, 0.5])  # a hand that was pushed there
+    back = limits.next_target(outside, np.array([0.5, 0.5, 0.5]), outside, 0.05)
+    assert np.allclose(back, (0.5, 1.285, 0.5))
     with pytest.raises(ValueError, match="no room"):
         Limits((0, 0, 0), (1, 0, 1))
     with pytest.raises(ValueError, match="speed is 0"):
@@ -214,6 +220,54 @@ def test_an_operator_aborts_pauses_and_says_success():
     _, reward, terminated, truncated, info = env.step(STILL)
     assert (reward, terminated, truncated, info["is_success"]) == (1.0, True, False, True)
     env.close()
+    assert operator.closed
+
+
+def test_a_key_that_came_too_late_is_not_the_next_episodes():
+    operator, pressed = Operator(), [True]
+    env = RehearsalEnv("reach", operator=operator)
+    operator.succeeded = lambda: pressed.pop() if pressed else False
+    env.reset(seed=0)
+    assert not env.step(STILL)[4]["is_success"]
+    env.close()
+
+
+def test_the_hand_does_not_go_home_while_the_operator_pauses(monkeypatch):
+    monkeypatch.setattr(RehearsalEnv, "_put_back", RobotEnv._put_back)  # as a real one's
+    operator = Operator()
+    env = RehearsalEnv("reach", operator=operator)
+    env.reset(seed=0)
+    played(env, SIDEWAYS, 12)
+    at, asked = env.robot.arm.state().position, []
+
+    def paused():  # for 2 s of the next reset
+        asked.append(np.abs(env.robot.arm.state().position - at).max())
+        return len(asked) < 60
+
+    operator.paused = paused
+    env.reset(seed=1)
+    assert max(asked[:60]) < 0.004
+    assert np.abs(env.robot.arm.state().position - at).max() > 0.02
+    env.close()
+
+
+def test_whatever_a_driver_raises_stops_the_arm(monkeypatch):
+    env = RehearsalEnv("reach")
+    env.reset(seed=0)
+
+    def fails():
+        raise RuntimeError("a driver's own\nerror")
+
+    monkeypatch.setattr(env.robot.arm, "state", fails)
+    with pytest.warns(RuntimeWarning, match="the arm was stopped: a driver's own$"):
+        env._watch()
+    assert env.fault == "a driver's own"
+    monkeypatch.undo()
+    env.close()
+
+
+def test_a_terminals_interrupt_leaves_the_rehearsal_robot_alone(reach):
+    assert os.getpgid(reach.robot._process.pid) != os.getpgid(0)
 
 
 @pytest.mark.parametrize("at_once", [False, True])

@@ -91,6 +91,14 @@ def test_what_is_wrong_is_said_once(env, kind, line, tmp_path, capsys):
         assert "test_watch.py" in said[kind]
 
 
+@pytest.mark.parametrize("n_envs", [3, 4])
+def test_a_flat_reward_of_several_environments(n_envs):
+    env = VecFrameStack(DummyVecEnv([lambda: Flat(reward=distance)] * n_envs), 2)
+    watch = Watch(None, episodes=10, guided=3, frozen=15, hung=5)
+    new_model(env).learn(400, watch)
+    assert "at every step of 1" in watch.said["reward"]
+
+
 def test_a_critic_that_diverges_is_named():
     class Bias(BaseCallback):
         def _on_step(self):
