@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -427,7 +428,7 @@ def _report(runs: list[Path], out: Path | None) -> None:
         return
     from regil_sb3.report import write_comparison
 
-    out = out or runs[0].resolve().parent / "comparison.html"
+    out = out or Path(os.path.abspath(runs[0])).parent / "comparison.html"
     print(f"comparison: {write_comparison(runs, out)}")
 
 

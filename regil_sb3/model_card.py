@@ -88,8 +88,11 @@ def write_card(run: Path, repo: str = "OWNER/NAME") -> Path:
     settings = Settings.load(run / "config.yaml", trust=True)  # nothing of it is run
     try:
         results: dict[str, Any] = json.loads((run / "evaluation.json").read_text("utf-8"))
-    except (OSError, ValueError) as error:
+        missing = {"policy", "steps", "frames", "seeds"} - set(results)
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{run} has no evaluation ({error}): regil evaluate {run}") from error
+    if missing:
+        raise ValueError(f"{run}'s policy is not evaluated: regil evaluate {run}")
     algorithm = ALGOS[settings.algo]
     guided = settings.warmup_steps > 0 or settings.hyperparams.get("bc_coef") != 0
     found = {name: results[name] for name in METHODS if name in results}

@@ -16,6 +16,7 @@ import io
 import json
 import pickle
 import zipfile
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType
@@ -116,6 +117,9 @@ def checked_model(path: str | PathLike[str] | BinaryIO) -> BinaryIO:
                 raise ValueError(f"its parts claim {inflated} bytes, the file has {len(content)}")
             if (damaged := archive.testzip()) is not None:
                 raise ValueError(f"its part {damaged!r} is damaged")
+            for part in archive.namelist():
+                if part.endswith(".pth"):
+                    _check_size(part, archive.read(part))
             data = json.loads(archive.read("data"))
         if not isinstance(data, dict):
             raise ValueError("its settings are no dictionary")
@@ -164,13 +168,21 @@ class SafeLoad(BaseAlgorithm):
             raise ValueError(f"{path} does not load: {str(error).splitlines()[0]}") from error
 
 
+def _check_size(part: str, content: bytes) -> None:
+    """Refuse a file of torch's, a zip in the zip, that would grow far beyond its size."""
+    with zipfile.ZipFile(io.BytesIO(content)) as inside:
+        inflated = sum(member.file_size for member in inside.infolist())
+    if inflated > _INFLATED * len(content) + _SLACK:
+        raise ValueError(f"{part} claims {inflated} bytes, and has {len(content)}")
+
+
 def _check_pickle(key: str, text: Any) -> None:
     try:
         pickled = base64.b64decode(text)
     except (TypeError, binascii.Error) as error:
         raise ValueError(f"{key!r} is damaged ({error})") from None
     try:
-        _Checked(io.BytesIO(pickled)).load()
+        _Checked(pickled).load()
     except _RefusedError as refused:
         raise ValueError(
             f"{key!r} names {refused}, which a model does not need and which could run code; if "
@@ -193,6 +205,11 @@ class _Checked(_Unpickler):  # type: ignore[misc]
 
     dispatch: ClassVar[dict[int, Any]] = dict(_Unpickler.dispatch)
 
+    def __init__(self, pickled: bytes) -> None:
+        super().__init__(io.BytesIO(pickled))
+        self._size = len(pickled)
+        self._left = 4 * self._size + 1_000  # items that calls may take over
+
     def find_class(self, module: str, name: str) -> Any:
         if not any(name in known.get(module, ()) for known in (_CALLED, _MADE, _NAMED)):
             raise _RefusedError(f"{module}.{name}")
@@ -212,6 +229,9 @@ class _Checked(_Unpickler):  # type: ignore[misc]
     def load_reduce(self) -> None:
         self._check(_CALLED)
         arguments = self.stack[-1]
+        self._left -= sum(len(one) for one in arguments if hasattr(one, "__len__"))
+        if self._left < 0:
+            raise _RefusedError("many more items than it holds")
         if self.stack[-2] is _SCALAR and len(arguments[1]) != arguments[0].itemsize:
             raise _RefusedError(f"a number of {arguments[0].itemsize} bytes")
         super().load_reduce()
@@ -228,6 +248,21 @@ class _Checked(_Unpickler):  # type: ignore[misc]
     def _refuse(self) -> None:
         raise _RefusedError("another way to call")
 
+    def _bytearray(self) -> None:
+        """It would be made as long as it says, before it is read."""
+        length = int.from_bytes(self.read(8), "little")
+        if length > self._size:
+            raise _RefusedError("more bytes than it holds")
+        content = bytearray(length)
+        self.readinto(content)
+        self.append(content)
+
+    def _put(self, opcode: int) -> None:
+        """A place in the memo far beyond the last would be made with all before it."""
+        _Unpickler.dispatch[opcode](self)
+        if next(reversed(self.memo)) > len(self.memo):
+            raise _RefusedError("a place far beyond what it holds")
+
     dispatch[pickle.REDUCE[0]] = load_reduce
     dispatch[pickle.NEWOBJ[0]] = load_newobj
     dispatch[pickle.BUILD[0]] = load_build
@@ -240,3 +275,6 @@ class _Checked(_Unpickler):  # type: ignore[misc]
         pickle.EXT4,
     ):
         dispatch[_opcode[0]] = _refuse
+    dispatch[pickle.BYTEARRAY8[0]] = _bytearray
+    for _opcode in (pickle.PUT, pickle.BINPUT, pickle.LONG_BINPUT):
+        dispatch[_opcode[0]] = partial(_put, opcode=_opcode[0])

@@ -21,6 +21,8 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
+from regil_sb3.arguments import check_number
+
 _DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
 _AVERAGED = 10  # of the first updates: the average takes in about a tenth of those done
 
@@ -265,6 +267,7 @@ class ImagePolicy(TD3Policy):
                 f"CnnPolicy needs image observations (uint8, 0 to 255), not {observation_space}: "
                 "use MlpPolicy or MultiInputPolicy"
             )
+        check_number("random_shift", random_shift, (int,), 0, th.inf)
         features_extractor_class = encoder_class(features_extractor_class)
         if optimizer_kwargs is None and "optimizer_class" not in kwargs:
             optimizer_kwargs = {"fused": True}

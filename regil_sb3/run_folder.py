@@ -91,7 +91,7 @@ def load_calibration(env: VecEnv, path: Path) -> bool:
         return False
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged ({error}): remove it") from error
     env.env_method("set_calibration", found)
     return True

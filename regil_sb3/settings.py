@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
 from regil_wrappers import RetrievalGuideWrapper, RetrievalRewardWrapper, make_encoder
 from regil_wrappers.encoders import runs_code
@@ -117,6 +118,7 @@ class Settings:
             read = yaml.safe_load(path.read_text(encoding="utf-8"))
             read = {"algo": "td3bc", "eval_freq": None, **read}  # which older runs do not say
             settings = cls(**{name: read[name] for name in cls.__dataclass_fields__})
+            settings._check(str(read.get("versions")))
             code = [] if trust else settings._code(path.parent)
         except _UNREADABLE as error:
             raise ValueError(
@@ -129,12 +131,25 @@ class Settings:
             )
         return settings
 
+    def _check(self, versions: str) -> None:
+        """Refuse what no version writes, or another one."""
+        if self.algo not in ALGOS:
+            raise ValueError(f"algo {self.algo!r} is not known here; it was made by {versions}")
+        for name, kind in (("env_kwargs", dict), ("env_wrapper", list), ("hyperparams", dict)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} is {getattr(self, name)!r:.60}")
+        _check_counts(self)
+        for _ in map(_named, self.env_wrapper):
+            pass
+
     def _code(self, run: Path) -> list[str]:
         """What of the config of a run's folder names a program, in whichever wrapper."""
         entries = [entry for entry in self.env_wrapper if isinstance(entry, dict)]
         given = [arguments or {} for entry in entries for arguments in entry.values()]
         encoders = [str(arguments["encoder"]) for arguments in given if "encoder" in arguments]
         code = [f"encoder {name!r}" for name in encoders if runs_code(name)]
+        named = (_named(entry)[0] for entry in self.env_wrapper)
+        code += [f"wrapper {name!r}" for name in named if name not in _TAKE_DEMO]
         module, separator, _ = self.env.partition(":")
         if separator and _is_in(module, run):
             code.append(f"environment {self.env!r}")
@@ -224,9 +239,12 @@ class Settings:
                 )
             module, _, attribute = name.rpartition(".")
             try:
-                out.append((getattr(import_module(module), attribute), arguments))
+                found = getattr(import_module(module), attribute)
             except (ImportError, AttributeError) as error:
                 raise ValueError(f"env_wrapper {name!r} does not exist: {error}") from error
+            if not (isinstance(found, type) and issubclass(found, gym.Wrapper)):
+                raise ValueError(f"env_wrapper {name!r} is no gymnasium.Wrapper")
+            out.append((found, arguments))
         return out
 
 
@@ -319,6 +337,15 @@ def make_settings(
                 arguments["encoder"] = absolute(encoder)
     if steps is not None:
         settings.steps = steps
+    _check_counts(settings)
+    for name in settings.hyperparams:
+        if name not in known:
+            what = ALGOS[settings.algo].__name__
+            raise ValueError(f"preset {preset!r}: {name!r} is no argument of {what}")
+    return settings
+
+
+def _check_counts(settings: Settings) -> None:
     for name in ("steps", "n_envs", "frame_stack", "eval_episodes", "eval_freq"):
         value = getattr(settings, name)
         if name == "eval_freq" and value is None:
@@ -326,11 +353,6 @@ def make_settings(
         least = 0 if name == "eval_episodes" else 1
         if type(value) is not int or value < least:
             raise ValueError(f"{name} is {value!r}: it must be a whole number of at least {least}")
-    for name in settings.hyperparams:
-        if name not in known:
-            what = ALGOS[settings.algo].__name__
-            raise ValueError(f"preset {preset!r}: {name!r} is no argument of {what}")
-    return settings
 
 
 def pairs(words: list[str]) -> dict[str, Any]:
@@ -409,6 +431,8 @@ def _override(settings: Settings, key: str, value: Any) -> None:
     elif key.startswith("policy_kwargs."):
         name = key.removeprefix("policy_kwargs.")
         settings.hyperparams.setdefault("policy_kwargs", {})[name] = value
+    elif key == "policy_kwargs" and not isinstance(value, dict):
+        raise ValueError(f"policy_kwargs={value!r}: write policy_kwargs.NAME=VALUE")
     elif key == "n_timesteps":
         settings.steps = value
     elif key in own:

@@ -358,7 +358,7 @@ def _new_model(settings: Settings, demo: Demonstration, env: VecEnv) -> Learner:
         model: Learner = algorithm(
             settings.policy, env, demo=demo, seed=settings.seed, **settings.hyperparams
         )
-    except TypeError as error:  # an argument of the policy's that does not exist
+    except (TypeError, AssertionError, AttributeError) as error:  # of the policy's arguments
         name = algorithm.__name__
         raise ValueError(f"the settings do not fit {name} or its policy: {error}") from error
     return model

@@ -151,6 +151,7 @@ class BAKUPolicy(BasePolicy):
             raise ValueError(f"head is {head!r}: use one of mse, gaussian")
         for name, value in (("chunk", chunk), ("layers", layers), ("heads", heads)):
             check_number(name, value, (int,), 1, np.inf)
+        check_number("random_shift", random_shift, (int,), 0, np.inf)
         check_number("width", width, (int,), heads, np.inf)
         check_number("dropout", dropout, (int, float), 0.0, 1.0)
         check_number("smoothing", smoothing, (int, float), -np.inf, np.inf)

@@ -34,7 +34,10 @@ __all__ = ["check_cost"]
 
 _EPISODE = 20  # steps in the stand-in
 _STEPS = 4  # that are timed together: two updates of the default's
-_UNABLE = (TypeError, ValueError, RuntimeError, ArithmeticError, MemoryError)
+_UNABLE = (
+    *(TypeError, ValueError, RuntimeError, ArithmeticError, MemoryError),
+    *(AssertionError, AttributeError),  # Stable-Baselines3's own of a network's arguments
+)
 _ENOUGH, _MOST = 1.0, 40  # seconds and calls that one measurement takes; at least one call
 _BUSY = 0.8  # of a core: a learner that gets less is slower than it could be
 

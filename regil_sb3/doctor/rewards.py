@@ -80,7 +80,8 @@ class Reward:
         success: what successes are worth.
         failure: what failures are worth; None where nothing failed.
         still: what standing still is worth.
-        above_still: of successes with a return above standing still from the same start.
+        above_still: of pairs of a success and standing still, from whichever starts, in which the
+            success's return is higher.
         above_failure: of pairs of a success and a failure in which the success's return is higher;
             NaN where nothing failed.
         order: Spearman's rank correlation of reward and time within successes, mean, in [-1, 1].

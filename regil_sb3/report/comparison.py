@@ -24,7 +24,8 @@ __all__ = ["NOTE", "methods", "plots", "scores", "write_comparison"]
 
 _COLOURS = 6  # as many as the page has for methods
 _STYLES = ("solid", "dashed", "dotted")  # of lines: a colour comes once in each
-_NOT_COMPARED = ("env", "seed", "versions.", "defaults.")
+_NOT_COMPARED = ("versions.", "defaults.")  # what begins so
+_OF_A_SEED = {"env", "seed", "demo_actions"}
 _NAMED = 2  # settings in a method's name
 
 NOTE = (
@@ -145,7 +146,11 @@ def methods(runs: Runs) -> dict[str, list[RunContents]]:
 
 
 def _settings(run: RunContents) -> dict[str, Any]:
-    own = {k: v for k, v in flat(run.config) if not k.startswith(_NOT_COMPARED)}
+    own = {
+        key: value
+        for key, value in flat(run.config)
+        if not (key in _OF_A_SEED or key.startswith(_NOT_COMPARED) or key.endswith(".demo"))
+    }
     if own.get("preset") == run.env:  # a task's own section of the default
         own["preset"] = "default"
     return own

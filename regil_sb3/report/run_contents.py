@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,6 +33,8 @@ __all__ = [
 
 STEPS = "time/total_timesteps"
 _MARKS = ("config.yaml", "progress.csv", "evaluation.json")
+_MOST_VALUES, _DEEPEST = 1_000_000, 50  # in a file
+_LEAST = 1e-100  # smaller numbers, and larger than one over it, are not drawn
 
 Rows = list[dict[str, float]]
 
@@ -117,11 +118,23 @@ def read_run(run: Path | str) -> RunContents:
 def _mapping(value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"it holds a {type(value).__name__} where a mapping was expected")
+    stack, seen = [(value, 0)], 0
+    while stack:  # of aliases one within the other a few lines make any number
+        item, depth = stack.pop()
+        seen += 1
+        if seen > _MOST_VALUES or depth > _DEEPEST:
+            raise ValueError("it holds itself, or far more than a run says")
+        inside = item.values() if isinstance(item, dict) else item
+        if isinstance(item, dict | list):
+            stack += [(one, depth + 1) for one in inside]
     return {str(key): item for key, item in value.items()}
 
 
 def _yaml(path: Path) -> dict[str, Any]:
-    return _mapping(yaml.safe_load(path.read_text("utf-8")))
+    config = _mapping(yaml.safe_load(path.read_text("utf-8")))
+    if not isinstance(config.get("defaults") or {}, dict):
+        raise ValueError("its defaults are no mapping")
+    return config
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -156,12 +169,12 @@ def read_warnings(file: Path) -> list[dict[str, Any]]:
 
 
 def number(value: Any) -> float | None:
-    """A finite number, or None."""
+    """A finite number of a size that can be drawn, or None."""
     try:
         found = float(value)
     except (TypeError, ValueError):
         return None
-    return found if math.isfinite(found) else None
+    return found if found == 0 or _LEAST <= abs(found) <= 1 / _LEAST else None
 
 
 def column(rows: Rows, name: str) -> list[tuple[float, float]]:
@@ -176,6 +189,6 @@ def successes(result: Any) -> list[bool]:
     if isinstance(result.get("successes"), list):
         return [bool(success) for success in result["successes"]]
     rate, episodes = number(result.get("success")), number(result.get("episodes"))
-    if rate is None or episodes is None:
+    if rate is None or episodes is None or not 0 <= episodes <= _MOST_VALUES:
         return []
     return [i < round(rate * episodes) for i in range(int(episodes))]

@@ -71,6 +71,27 @@ def test_methods_and_scores(runs, tmp_path, capsys):
     assert "data:" not in re.sub(r"img-src data:", "", page)
 
 
+def test_wrappers_and_the_environment_make_a_method(tmp_path):
+    def of(name, change, seed=0):
+        run = made_run.run(tmp_path / name, films=False, solved=9, seed=seed)
+        config = yaml.safe_load((run / "config.yaml").read_text())
+        change(config)
+        (run / "config.yaml").write_text(yaml.safe_dump(config))
+        return read_run(run)
+
+    def wrapped(config, **arguments):
+        next(iter(config["env_wrapper"][0].values())).update(arguments)
+
+    runs = [
+        of("a", lambda config: config.update(demo_actions=40)),
+        of("a-1", lambda config: config.update(demo_actions=43), seed=1),  # as its demonstration
+        of("b", lambda config: wrapped(config, reward="sdtw")),
+        of("c", lambda config: config.update(env_kwargs={"camera": "corner3"})),
+        of("d", lambda config: wrapped(config, demo="another.hdf5")),
+    ]
+    assert [len(group) for group in methods(runs).values()] == [3, 1, 1]
+
+
 def test_what_differs_between_tasks_alone_is_no_method(runs):
     for run in runs:
         config = yaml.safe_load((run / "config.yaml").read_text())

@@ -138,6 +138,49 @@ def test_code_that_a_config_names_is_not_run(encoder, wrapper, run, tmp_path, ca
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.parametrize(
+    ("wrapper", "arguments"),
+    [
+        ("regil_wrappers.formats.fuzz.run", {"module": "run.evil"}),
+        ("gymnasium.wrappers.RecordVideo", {"video_folder": "films"}),
+    ],
+)
+def test_wrappers_of_a_downloaded_config_are_ours(wrapper, arguments, run, tmp_path, capsys):
+    (run / "evil.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'w')\n")
+    config(run, lambda said: said["env_wrapper"].append({wrapper: arguments}))
+    assert main(["evaluate", str(run), "--episodes", "1"]) == 2
+    assert f"names code to run, wrapper '{wrapper}'" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="trust=True"):
+        Settings.load(run / "config.yaml")
+    trusted = Settings.load(run / "config.yaml", trust=True)
+    if "fuzz" in wrapper:
+        with pytest.raises(ValueError, match=r"fuzz\.run' is no gymnasium\.Wrapper"):
+            trusted.wrappers("demo.hdf5")
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"algo": "sac"}, "algo 'sac' is not known here; it was made by"),
+        ({"frame_stack": None}, "frame_stack is None"),
+        ({"hyperparams": 3}, "hyperparams is 3"),
+    ],
+)
+def test_a_config_of_another_version_gets_one_line(change, said, run, capsys):
+    config(run, lambda own: own.update(change))
+    for words in (["evaluate", str(run), "--episodes", "1"], ["train", "--resume", str(run)]):
+        assert main(words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert said in line
+
+
+def test_a_damaged_calibration_gets_one_line(run, capsys):
+    (run / "calibration.json").write_text("[" * 200_000)
+    with pytest.raises(ValueError, match="is damaged"):
+        run_folder.load_calibration(None, run / "calibration.json")
+
+
 @pytest.mark.parametrize("module", ["run.evil", "evil"])
 def test_a_downloaded_environment_is_not_imported(module, run, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(run if module == "evil" else tmp_path)

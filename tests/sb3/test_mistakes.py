@@ -134,6 +134,9 @@ COMMANDS = [
     (["train", "--env", "nobody/knows-v0", "--demo", "good.hdf5", "--out", "new"], "nobody"),
     (train("--preset", "fast"), "fast"),
     (train("--episodes", "0"), "--episodes is 0"),
+    (train("--set", "policy_kwargs.net_arch=256"), "do not fit TD3BC or its policy"),
+    (train("--set", "policy_kwargs=5"), "write policy_kwargs.NAME=VALUE"),
+    (train("--set", "policy_kwargs.random_shift=-1"), "random_shift is -1"),
     (train("--steps", "0"), "steps is 0"),
     (train("--steps", "100", "--set", "warmup_steps=100"), "end before the warm-up"),
     # the demonstration

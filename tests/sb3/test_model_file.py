@@ -125,6 +125,39 @@ def test_a_part_that_grows_is_refused(saved, tmp_path):
         TD3BC.load(path)
 
 
+@pytest.mark.parametrize(
+    "pickled",
+    [
+        pickle.PROTO + b"\x05" + pickle.BYTEARRAY8 + (2**40).to_bytes(8, "little") + b".",
+        pickle.PROTO + b"\x02N" + pickle.LONG_BINPUT + (4 * 10**7).to_bytes(4, "little") + b".",
+        pickle.PROTO + b"\x02Np40000000\n.",
+        pickle.PROTO
+        + b"\x02]q\x00("
+        + b"N" * 1_000
+        + b"e0ccollections\ndeque\nq\x01"
+        + b"h\x01h\x00\x85R0" * 1_000
+        + b"N.",
+    ],
+    ids=["bytearray", "long_binput", "put", "deques"],
+)
+def test_pickles_that_claim_memory_are_refused(saved, tmp_path, pickled):
+    path = with_pickle(saved, tmp_path / "hostile.zip", pickled, "ep_info_buffer")
+    with pytest.raises(ValueError, match=r"ep_info_buffer' names .* which a model does not need"):
+        TD3BC.load(path)
+
+
+def test_weights_that_grow_are_refused(saved, tmp_path):
+    path, inside = tmp_path / "bomb.zip", io.BytesIO()
+    with zipfile.ZipFile(inside, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data/0", bytes(50_000_000))
+    with zipfile.ZipFile(saved) as old, zipfile.ZipFile(path, "w") as new:
+        for name in old.namelist():
+            content = inside.getvalue() if name == "policy.pth" else old.read(name)
+            new.writestr(name, content)
+    with pytest.raises(ValueError, match=r"policy\.pth claims 50000000 bytes"):
+        TD3BC.load(path)
+
+
 def test_weights_are_tensors_or_nothing(saved, tmp_path):
     marker, path = tmp_path / "executed", tmp_path / "model.zip"
     hostile = io.BytesIO()

@@ -238,6 +238,29 @@ def test_a_file_nested_too_deeply_costs_its_part_of_the_page_only(run, name):
     assert f"{name} cannot be read" in _page(run)[0]
 
 
+LAUGHS = "a0: &a0 {b: 1}\n" + "".join(
+    f"a{i}: &a{i} {{{', '.join(f'k{n}: *a{i - 1}' for n in range(9))}}}\n" for i in range(1, 12)
+)
+
+
+@pytest.mark.parametrize("text", [LAUGHS, "a: &a {b: *a}", "a: &a [*a]", "defaults: 5"])
+def test_settings_that_hold_themselves_cost_their_part_of_the_page_only(run, text):
+    (run / "config.yaml").write_text(text)
+    assert "config.yaml cannot be read" in _page(run)[0]
+
+
+def test_numbers_that_cannot_be_drawn_are_left_out(run):
+    whole = (run / "progress.csv").read_text().splitlines()
+    for number in ("1e308", "-1e308", "1e-323"):
+        cells = ",".join([number] * whole[0].count(",")) + ",7000"
+        (run / "progress.csv").write_text("\n".join([*whole, cells]) + "\n")
+        assert "<h2>Success over steps</h2>" in _page(run)[0]
+    for episodes in (4_000_000_000, 1e300, -1):
+        result = {"success": 1.0, "episodes": episodes}
+        (run / "evaluation.json").write_text(json.dumps({"policy": result}))
+        assert "not evaluated: Policy" in _page(run)[0]
+
+
 def test_damaged_films_are_left_out(run):
     path, rng = run / "success_buffer.npz", np.random.default_rng(0)
     content = path.read_bytes()

@@ -156,6 +156,11 @@ def test_zip_bombs(tmp_path: Path) -> None:
         with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("frames.npy", npy(shape, bytes(10**6)))
         refused(tmp_path / "a.npz", message)
+    with zipfile.ZipFile(tmp_path / "c.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        length = 10**8
+        header = b"\x93NUMPY\x02\x00" + length.to_bytes(4, "little") + b" " * length
+        archive.writestr("frames.npy", header)
+    refused(tmp_path / "c.npz", "header of 100000000 bytes")
     with zipfile.ZipFile(tmp_path / "b.npz", "w", zipfile.ZIP_BZIP2) as archive:
         archive.writestr("frames.npy", npy((10**4, 10, 10, 3), bytes(3 * 10**6)))
     refused(tmp_path / "b.npz", "packed in a way")

@@ -68,7 +68,8 @@ def check_gripper(
     """
     if gripper_dim is None:
         return
-    if not 0 <= gripper_dim < len(low) or gripper_dim in dims:
+    whole = isinstance(gripper_dim, int) and not isinstance(gripper_dim, bool)
+    if not whole or not 0 <= gripper_dim < len(low) or gripper_dim in dims:
         raise ValueError(
             f"gripper_dim={gripper_dim}: it must be a dimension of the actions that is not "
             f"one of translation_dims={list(dims)}"

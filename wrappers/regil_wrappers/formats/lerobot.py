@@ -150,7 +150,10 @@ def _inside(root: Path, template: str, values: dict[str, Any]) -> Path:
     name = re.sub(r"\{(\w+)(?::0?(\d{1,2})d)?\}", put, template)
     file = (root / name).resolve()
     if "{" in name or not file.is_relative_to(root.resolve()):
-        raise ValueError(f"the path {name!r} leads out of the dataset's folder")
+        raise ValueError(
+            f"the path {name!r} leads out of the dataset's folder: where it is a link, as in the "
+            "hub's cache, download with --local-dir"
+        )
     if not file.is_file():
         raise ValueError(f"the dataset has no file {name!r}: is it downloaded, with this episode?")
     return file
