@@ -254,6 +254,7 @@ def _yaml(folder: Path) -> Callable[[int], str]:
         "env: \x00",
         "%YAML 9.9\n---\n",
         "<<: 3",
+        "env_wrapper: [{regil_wrappers.formats.fuzz.run: {module: this}}]",
     ]
 
     def case(number: int) -> str:

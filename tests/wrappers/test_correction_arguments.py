@@ -182,6 +182,7 @@ def refused(message: str, **settings: Any) -> None:
         (r"\(0 to 3\)", {"translation_dims": [0, 1, 7]}),
         ("gripper_dim=2: it must be", {"gripper_dim": 2}),
         ("gripper_dim=9: it must be", {"gripper_dim": 9}),
+        (r"gripper_dim=0\.5: it must be", {"gripper_dim": 0.5}),
         ("plane=.*three positive", {"plane": [1.0, 0.0, 1.0]}),
         ("plane=.*three positive", {"plane": [1.0, 1.0]}),
         ("plane=.*three positive", {"plane": [1.0, float("nan"), 1.0]}),
