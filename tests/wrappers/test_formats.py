@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import struct
 import subprocess
@@ -442,3 +443,12 @@ def test_plain_arrow_only(tmp_path: Path) -> None:
         out.write_table(table)
     with pytest.raises(ValueError, match="compressed"):
         formats.read(tmp_path / "set")
+
+
+def test_lerobots_vectors_of_one_number(tmp_path: Path) -> None:
+    one = DEMO.frames[:, 0, 0, :1].astype(np.float32)
+    demo = dataclasses.replace(DEMO, observations={"width": one})
+    formats.write(demo, tmp_path / "set", "lerobot")
+    found = formats.read(tmp_path / "set").observations
+    assert isinstance(found, dict)
+    np.testing.assert_array_equal(found["width"], one[:-1])  # the last frame is lost

@@ -109,7 +109,7 @@ def read(
     found = {name: numbers(rows[name], name) for name in rows if name != "episode_index"}
     solved = found.get("next.success")
     metadata, as_array = _ours(path)
-    kept: Any = {key: found[_PREFIX + key] for key in keys} or None
+    kept: Any = {key: _two_dimensional(found[_PREFIX + key]) for key in keys} or None
     if as_array and len(keys) == 1:
         kept = kept[keys[0]]
     return {
@@ -123,9 +123,9 @@ def read(
     }
 
 
-def _two_dimensional(actions: NDArray[Any]) -> NDArray[Any]:
-    """An action of one number is stored as a plain column."""
-    return actions[:, None] if actions.ndim == 1 else actions
+def _two_dimensional(vectors: NDArray[Any]) -> NDArray[Any]:
+    """Vectors of one number are stored as a plain column."""
+    return vectors[:, None] if vectors.ndim == 1 else vectors
 
 
 def _text(info: Any, name: str) -> str:
