@@ -73,6 +73,7 @@ class BackgroundTD3BC(TD3BC):
     _learner: threading.Thread | None = None
     _own_logger: Logger | None = None
     _owed = 0  # updates
+    _left = False  # by an error
 
     @property
     def logger(self) -> Logger:
@@ -98,7 +99,7 @@ class BackgroundTD3BC(TD3BC):
         self._inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self._failure: BaseException | None = None
         self._turn = threading.Condition()
-        self._ends = self._busy = False
+        self._ends = self._busy = self._left = False
         self._held = True  # until learn is set up: a checkpoint may have left updates owed
         self._own_logger = Logger(None, [])
         self._copies = [copy.deepcopy(self.policy) for _ in range(2)]
@@ -117,7 +118,7 @@ class BackgroundTD3BC(TD3BC):
                 progress_bar,
             )
         except BaseException:
-            self._owed = 0  # who interrupts does not want to wait
+            self._owed, self._left = 0, True  # who interrupts does not want to wait
             raise
         finally:
             assert self.env is not None
@@ -165,7 +166,7 @@ class BackgroundTD3BC(TD3BC):
         """As `TD3BC.pretrain_bc`; in the learner's thread it ends where `learn` is left."""
 
         def go_on(done: int) -> None:
-            if self._ends:
+            if self._left:
                 raise RuntimeError(f"learn was left after {done} of {steps} updates by cloning")
             if progress is not None:
                 progress(done)
@@ -269,7 +270,7 @@ class BackgroundTD3BC(TD3BC):
 
     def _excluded_save_params(self) -> list[str]:
         ours = ("_acting", "_learner", "_own_logger", "_inbox", "_turn", "_copies", "_failure")
-        return [*super()._excluded_save_params(), *ours, "_owed"]
+        return [*super()._excluded_save_params(), *ours, "_owed", "_left"]
 
 
 def at_rest(model: Any) -> AbstractContextManager[None]:

@@ -196,6 +196,12 @@ class _RefusedError(Exception):
     pass
 
 
+def _is_of_numbers(dtype: Any, state: Any) -> bool:
+    """Whether this is what NumPy writes of a plain type of numbers."""
+    plain = isinstance(state, tuple) and len(state) == 8 and state[0] == 3
+    return bool(plain and dtype.kind in "biuf" and state[2:] == (None, None, None, -1, -1, 0))
+
+
 _SCALAR = np.float64(0).__reduce__()[0]
 _Unpickler: Any = pickle._Unpickler  # the one in Python, whose steps can be looked at
 
@@ -229,9 +235,8 @@ class _Checked(_Unpickler):  # type: ignore[misc]
     def load_reduce(self) -> None:
         self._check(_CALLED)
         arguments = self.stack[-1]
-        self._left -= sum(len(one) for one in arguments if hasattr(one, "__len__"))
-        if self._left < 0:
-            raise _RefusedError("many more items than it holds")
+        for one in arguments:
+            self._take_over(one)
         if self.stack[-2] is _SCALAR and len(arguments[1]) != arguments[0].itemsize:
             raise _RefusedError(f"a number of {arguments[0].itemsize} bytes")
         super().load_reduce()
@@ -241,9 +246,20 @@ class _Checked(_Unpickler):  # type: ignore[misc]
         super().load_newobj()
 
     def load_build(self) -> None:
-        if isinstance(it := self.stack[-2], (type, FunctionType, BuiltinFunctionType)):
+        it, state = self.stack[-2:]
+        if isinstance(it, (type, FunctionType, BuiltinFunctionType, np.ndarray, np.generic)):
             raise _RefusedError(f"a change of {it!r}")
+        if isinstance(it, np.dtype) and not _is_of_numbers(it, state):
+            raise _RefusedError(f"a type of numbers that is none ({state!r:.60})")
+        for part in state if isinstance(state, tuple) else (state,):
+            self._take_over(part)
         super().load_build()
+
+    def _take_over(self, one: Any) -> None:
+        """Count the items of which a copy is made."""
+        self._left -= len(one) if hasattr(one, "__len__") else 0
+        if self._left < 0:
+            raise _RefusedError("many more items than it holds")
 
     def _refuse(self) -> None:
         raise _RefusedError("another way to call")

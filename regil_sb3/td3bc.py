@@ -190,7 +190,7 @@ class TD3BC(SafeLoad, TD3):
         check_arguments(locals())
         check_action_space("TD3BC", env)
         self.demo = Demonstration.load(demo) if isinstance(demo, str | PathLike) else demo
-        train_freq = train_freq if isinstance(train_freq, int) else tuple(train_freq)  # type: ignore[assignment]
+        train_freq = tuple(train_freq) if isinstance(train_freq, list) else train_freq
         self.warmup_steps, self.guide_again = warmup_steps, guide_again
         self.bc_coef, self.bc_floor, self.bc_steps = bc_coef, bc_floor, bc_steps
         self.bc_schedule = bc_schedule
@@ -778,6 +778,8 @@ def _that_fits() -> Iterator[None]:
         try:
             yield
         except UserWarning as warning:
+            if "enough memory" not in str(warning):
+                raise
             raise MemoryError(f"{str(warning).strip()}: set buffer_size lower") from None
 
 

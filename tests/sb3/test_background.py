@@ -194,6 +194,14 @@ def test_who_leaves_does_not_wait_for_the_updates_by_cloning(demo, monkeypatch):
     assert not model.pretrained
 
 
+def test_who_stops_waits_for_the_updates_by_cloning(demo, monkeypatch):
+    slow(monkeypatch)
+    model = made(demo, warmup_steps=20, learning_starts=0, train_freq=7, gradient_steps=7)
+    model.learn(1_000, callback=lambda *_: model.in_warmup or model.num_timesteps < 20)
+    assert model.num_timesteps < 60
+    assert model.pretrained
+
+
 class StoppedError(Exception):
     """Before the evaluation."""
 

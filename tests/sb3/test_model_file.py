@@ -137,8 +137,22 @@ def test_a_part_that_grows_is_refused(saved, tmp_path):
         + b"e0ccollections\ndeque\nq\x01"
         + b"h\x01h\x00\x85R0" * 1_000
         + b"N.",
+        pickle.PROTO
+        + b"\x02}q\x00("
+        + b"".join(b"K%cN" % i for i in range(200))
+        + b"ucstable_baselines3.common.utils\nConstantSchedule\nq\x01"
+        + b"h\x01)\x81h\x00b0" * 1_000
+        + b"N.",
+        # An array's own state, and a type whose numbers would be addresses
+        pickle.PROTO
+        + b"\x03cnumpy._core.numeric\n_frombuffer\n"
+        + b"(C\x00cnumpy\ndtype\nX\x02\x00\x00\x00f4\x89\x88\x87RK\x00\x85X\x01\x00\x00\x00CtR"
+        + b"(K\x01K\x01\x85cnumpy\ndtype\nX\x02\x00\x00\x00O8\x89\x88\x87R\x89]tb.",
+        pickle.PROTO
+        + b"\x02cnumpy\ndtype\nX\x02\x00\x00\x00O8\x89\x88\x87R"
+        + b"(K\x03X\x01\x00\x00\x00|NNNK\x08K\x08K\x00tb.",
     ],
-    ids=["bytearray", "long_binput", "put", "deques"],
+    ids=["bytearray", "long_binput", "put", "deques", "dicts", "an array", "a type"],
 )
 def test_pickles_that_claim_memory_are_refused(saved, tmp_path, pickled):
     path = with_pickle(saved, tmp_path / "hostile.zip", pickled, "ep_info_buffer")

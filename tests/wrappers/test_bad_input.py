@@ -90,7 +90,9 @@ def test_mirrored_objects_on_an_even_background_are_no_turned_picture() -> None:
 def test_settings_are_compared_as_a_file_gives_them_back(demo: Demonstration) -> None:
     env = ToyReach()
     env.metadata["regil"]["render"] = {"light": (1.0, 0.5), "at": np.zeros(2)}
-    as_read = {"light": [1.0, 0.5], "at": [0.0, 0.0]}
+    env.metadata["regil"]["render"]["kind"] = gym.vector.AutoresetMode.DISABLED  # no JSON value
+    kind = str(gym.vector.AutoresetMode.DISABLED)
+    as_read = {"light": [1.0, 0.5], "at": [0.0, 0.0], "kind": kind}
     RetrievalRewardWrapper(
         env, dataclasses.replace(demo, metadata={**demo.metadata, "render": as_read})
     )

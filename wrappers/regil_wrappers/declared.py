@@ -68,7 +68,7 @@ def check_gripper(
     """
     if gripper_dim is None:
         return
-    whole = isinstance(gripper_dim, int) and not isinstance(gripper_dim, bool)
+    whole = isinstance(gripper_dim, (int, np.integer)) and not isinstance(gripper_dim, bool)
     if not whole or not 0 <= gripper_dim < len(low) or gripper_dim in dims:
         raise ValueError(
             f"gripper_dim={gripper_dim}: it must be a dimension of the actions that is not "

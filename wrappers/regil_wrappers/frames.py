@@ -279,7 +279,11 @@ def check_recorded_settings(env: Asked, metadata: dict[str, Any], label: str) ->
 
 def _as_json(value: Any) -> Any:
     """As a file would give it back: what was recorded has been in one."""
-    return json.loads(json.dumps(value, default=lambda one: np.asarray(one).tolist()))
+
+    def plain(one: Any) -> Any:
+        return one.tolist() if isinstance(one, np.ndarray | np.generic) else str(one)
+
+    return json.loads(json.dumps(value, default=plain))
 
 
 def check_size(size: tuple[int, ...], recorded: tuple[int, ...], label: str) -> None:
