@@ -45,8 +45,8 @@ Named = Mapping[str, Runs]
 def write_comparison(runs: Sequence[Path | str], out: Path | str) -> Path:
     """Write one page that compares runs: of methods, over tasks and seeds.
 
-    Runs of one task that differ in nothing but their seed are runs of one method. Scores are the
-    last policy's success in unseen episodes (``evaluation.json``).
+    Runs of one task that differ in nothing but their seed and demonstration are runs of one method.
+    Scores are the last policy's success in unseen episodes (``evaluation.json``).
 
     Args:
         runs: folders that `regil train` wrote, two or more.
