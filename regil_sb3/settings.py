@@ -139,17 +139,15 @@ class Settings:
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(f"{name} is {getattr(self, name)!r:.60}")
         _check_counts(self)
-        for _ in map(_named, self.env_wrapper):
-            pass
+        for entry in self.env_wrapper:
+            _named(entry)
 
     def _code(self, run: Path) -> list[str]:
         """What of the config of a run's folder names a program, in whichever wrapper."""
-        entries = [entry for entry in self.env_wrapper if isinstance(entry, dict)]
-        given = [arguments or {} for entry in entries for arguments in entry.values()]
-        encoders = [str(arguments["encoder"]) for arguments in given if "encoder" in arguments]
+        named = list(map(_named, self.env_wrapper))
+        encoders = [str(given["encoder"]) for _, given in named if "encoder" in given]
         code = [f"encoder {name!r}" for name in encoders if runs_code(name)]
-        named = (_named(entry)[0] for entry in self.env_wrapper)
-        code += [f"wrapper {name!r}" for name in named if name not in _TAKE_DEMO]
+        code += [f"wrapper {name!r}" for name, _ in named if name not in _TAKE_DEMO]
         module, separator, _ = self.env.partition(":")
         if separator and _is_in(module, run):
             code.append(f"environment {self.env!r}")

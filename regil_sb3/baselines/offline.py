@@ -40,41 +40,28 @@ class Offline(BaseAlgorithm):
 
         However it ends, callbacks that have a ``close`` are closed.
         """
+        given = callback
         try:
-            self._learn(
-                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps,
-                progress_bar,
-            )  # fmt: skip
+            total_timesteps, callback = self._setup_learn(
+                total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+            )
+            callback.on_training_start(locals(), globals())
+            callback.on_rollout_start()
+            losses = []
+            while self.num_timesteps < total_timesteps:
+                losses.append(self.update())
+                self.num_timesteps += 1
+                self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+                if self.num_timesteps % log_interval == 0:
+                    self.logger.record("train/bc_loss", float(np.mean(losses)))
+                    self.dump_logs()
+                    losses.clear()
+                if not callback.on_step():
+                    break
+            callback.on_training_end()
         finally:
-            close_callbacks(callback)
+            close_callbacks(given)
         return self
-
-    def _learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback,
-        log_interval: int,
-        tb_log_name: str,
-        reset_num_timesteps: bool,
-        progress_bar: bool,
-    ) -> None:
-        total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        callback.on_training_start(locals(), globals())
-        callback.on_rollout_start()
-        losses = []
-        while self.num_timesteps < total_timesteps:
-            losses.append(self.update())
-            self.num_timesteps += 1
-            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            if self.num_timesteps % log_interval == 0:
-                self.logger.record("train/bc_loss", float(np.mean(losses)))
-                self.dump_logs()
-                losses.clear()
-            if not callback.on_step():
-                break
-        callback.on_training_end()
 
     def dump_logs(self) -> None:
         """Write log data."""

@@ -39,7 +39,6 @@ _LABEL = "the demonstration"
 # A first picture whose nearest fresh one is farther off than fresh ones are from their nearest
 # ("far", as a multiple) may still be of the same scene with the target at another place.
 _EXPLAINED = 0.65  # share of the difference that may be left when what moved is moved back
-_ELSEWHERE = 0.35  # of the pixels differ: not one thing that moved
 _FAR, _TOO_FAR = 1.5, 2.0  # unexplained, and whatever explains it
 _REGISTERED = 4  # of the nearest fresh pictures are registered, at 0.1 s each
 
@@ -143,15 +142,15 @@ def check_scene(
     nearest = np.argsort(to_fresh)[:_REGISTERED]
     moved = [register(recorded_first, firsts[i]) for i in nearest]
     left = min(0.0 if m is None else m.ratio for m in moved)
-    changed = min(0.0 if m is None else m.changed for m in moved)
     cameras = [m.camera for m in moved if m is not None and any(m.camera)]
     distance = (
         f"its first picture is {to_fresh.min():.2g} from the nearest of {len(fresh)} fresh ones, "
         f"which are up to {spread:.2g} from their nearest"
     )
     shown = [("demonstration", recorded_first), ("nearest fresh episode", firsts[nearest[0]])]
-    if far > 1 and changed > _ELSEWHERE:
-        line = f"{distance}; {changed:.0%} of the pixels differ: another camera or scene"
+    elsewhere = [m.changed for m in moved if m is not None and m.another_scene]
+    if far > 1 and len(elsewhere) == len(moved):
+        line = f"{distance}; {min(elsewhere):.0%} of the pixels differ: another camera or scene"
         found.append(Finding("scene", "wrong", f"{line}, record it with this one", shown))
     elif 2 * len(cameras) > len(moved) and left <= _EXPLAINED:
         x, y = np.median(cameras, axis=0)

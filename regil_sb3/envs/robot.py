@@ -347,8 +347,7 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
                 return
             try:
                 self._arm.recover()
-                if self._steps >= 0:
-                    self._target = self._arm.state().position.copy()
+                self._target = self._arm.state().position.copy()
             except RobotError as error:
                 self._stop(str(error))
 
@@ -557,6 +556,4 @@ class RobotEnv(gym.Env[npt.NDArray[np.uint8], npt.NDArray[np.float32]]):
         while self._operator.paused() and self.fault is None:
             self._clock.sleep_until(self._clock.now() + self._period)
         self.resume()
-        with contextlib.suppress(RobotError):  # the watchdog says so
-            self._target = self._arm.state().position.copy()
         return self._clock.now() - began

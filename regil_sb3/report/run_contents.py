@@ -124,8 +124,8 @@ def _mapping(value: Any) -> dict[str, Any]:
         seen += 1
         if seen > _MOST_VALUES or depth > _DEEPEST:
             raise ValueError("it holds itself, or far more than a run says")
-        inside = item.values() if isinstance(item, dict) else item
         if isinstance(item, dict | list):
+            inside = item.values() if isinstance(item, dict) else item
             stack += [(one, depth + 1) for one in inside]
     return {str(key): item for key, item in value.items()}
 

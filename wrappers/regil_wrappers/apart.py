@@ -162,10 +162,11 @@ def register_apart(
             fits[i] = _Fit(centre, *found)
     explained = _explained(pair, own, rest, fits)
     taken_one, place = (_displacement(pair, fit, m) for fit, m in zip(fits, explained, strict=True))
-    before, after = explained[1]
-    covered = _arrived(own, fits[0], pair.unit)
-    if place is not None and not _stands_alone(place, (before * ~covered, after), own, pair.unit):
-        place = None
+    if place is not None:
+        before, after = explained[1]
+        seen = before * ~_arrived(own, fits[0], pair.unit)
+        if not _stands_alone(place, (seen, after), own, pair.unit):
+            place = None
     return Apart(taken_one, place)
 
 

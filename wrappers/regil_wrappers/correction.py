@@ -265,8 +265,7 @@ class Servo:
             self._moving = not self._calibration.over
             return
         if self._way.kind != "plain":
-            delta = np.asarray(action, float)[self._dims]
-            self._hand = self._hand + self._clipped(delta)
+            self._hand = self._hand + np.asarray(action, float)[self._dims]
             self._turned = self._turned + np.asarray(action, float)[self._rotations]
             self._at = self._next_place()
             self._next_kick()

@@ -88,10 +88,10 @@ def array_of(archive: zipfile.ZipFile, name: str, budget: Budget) -> NDArray[Any
         )
     with archive.open(info) as file:
         start = file.read(12)
-    length = int.from_bytes(start[8:12] if start[6:7] == b"\x02" else start[8:10], "little")
-    if length > _MOST_HEADER:  # NumPy would read it all first
-        raise ValueError(f"{name!r} has a header of {length} bytes, more than {_MOST_HEADER}")
-    with archive.open(info) as file:
+        length = int.from_bytes(start[8:12] if start[6:7] == b"\x02" else start[8:10], "little")
+        if length > _MOST_HEADER:  # NumPy would read it all first
+            raise ValueError(f"{name!r} has a header of {length} bytes, more than {_MOST_HEADER}")
+        file.seek(0)
         version = npy.read_magic(file)
         header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
         if header is None:
