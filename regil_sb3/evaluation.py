@@ -94,27 +94,37 @@ def guide_act(obs: Any, env: VecEnv, first: bool) -> npt.NDArray[Any]:
 
 
 class ResetWhenAsked(gym.Wrapper[Any, Any, Any, Any]):
-    """For what exists once: SB3 resets an environment where its episode ends, and again for a seed.
+    """For what exists once: nobody has to put a scene back for an episode that is not played.
 
-    Of these two the first, which is given no seed, returns the last observation: nobody has to put
-    a scene back for an episode that is not played.
+    A reset without a seed returns what was seen last where no step came since another reset, as
+    when SB3 begins to learn in an environment that was looked at. Where an episode of evaluation
+    has ended, so do all resets without a seed of evaluation.
+
+    Args:
+        env: a robot's, or what is around it.
+        evaluates: whether each episode that is played has a seed of evaluation.
     """
 
-    _last: Any = None
+    def __init__(self, env: gym.Env[Any, Any], evaluates: bool) -> None:
+        super().__init__(env)
+        self.evaluates = evaluates
+        self._seen: tuple[Any, dict[str, Any]] | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset, unless an episode has just ended and no seed is given."""
-        last, self._last = self._last, None
-        if seed is None and last is not None:
-            return last, {}
-        return super().reset(seed=seed, options=options)
+        """Reset, unless it is in vain."""
+        asked = seed is not None and (seed >= EVALUATION_SEED or not self.evaluates)
+        if self._seen is None or asked or options is not None:
+            self._seen = None
+            self._seen = super().reset(seed=seed, options=options)
+        return self._seen
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step."""
         observation, reward, terminated, truncated, info = super().step(action)
-        self._last = observation if terminated or truncated else None
+        ended = self.evaluates and (terminated or truncated)
+        self._seen = (observation, {}) if ended else None
         return observation, reward, terminated, truncated, info
 
 

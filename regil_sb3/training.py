@@ -79,7 +79,7 @@ def make_env(
         settings: of the run.
         demo: the demonstration's file, given to the retrieval wrappers.
         n_envs: instead of the run's own number.
-        evaluates: whether it is for `evaluate` alone: `ResetWhenAsked`.
+        evaluates: whether it is for `evaluate` alone (`ResetWhenAsked`).
 
     Raises:
         ValueError: the environment, its arguments or the demonstration do not fit.
@@ -95,7 +95,7 @@ def make_env(
         for wrapper, arguments in wrappers:
             env = wrapper(env, **arguments)
         if once:
-            return ResetWhenAsked(env) if evaluates else env
+            return ResetWhenAsked(env, evaluates)
         return ReplayableEpisode(env)
 
     try:

@@ -212,6 +212,8 @@ class Robot(toy_env.ToyReach):
     open_ones = 0
     steps_of_all = 0
     put_back = 0
+    in_vain = 0
+    played = True
 
     def __init__(self, **settings):
         if Robot.open_ones:
@@ -222,10 +224,13 @@ class Robot(toy_env.ToyReach):
 
     def reset(self, *, seed=None, options=None):
         Robot.put_back += 1
+        Robot.in_vain += not self.played
+        self.played = False
         return super().reset(seed=seed, options=options)
 
     def step(self, action):
         Robot.steps_of_all += 1
+        self.played = True
         return super().step(action)
 
     def close(self):
@@ -236,6 +241,7 @@ class Robot(toy_env.ToyReach):
 def robot(words, monkeypatch):
     """Words of a `regil train` on it."""
     monkeypatch.setattr(Robot, "open_ones", 0)
+    monkeypatch.setattr(Robot, "in_vain", 0)
     monkeypatch.setattr(training, "BC_UPDATES", 3)
     gym.register("OneRobot-v0", Robot)
     yield [*(word.replace("ToyReach", "OneRobot") for word in words), "--algo", "td3bc-background"]
@@ -265,6 +271,7 @@ def test_a_robot_is_opened_once_at_a_time(robot, tmp_path, capsys):
     found = json.loads((run / "evaluation.json").read_text())
     played = sum(found[name]["episodes"] for name in METHODS if name in found)
     assert Robot.put_back == played  # the scene, once for each
+    assert Robot.in_vain == 0
 
 
 def test_several_of_a_robot_are_refused(robot, capsys):
