@@ -144,7 +144,8 @@ class TrainingCallback(BaseCallback):
         self._next = (self.num_timesteps // self.every + 1) * self.every
         self._first = self.best < 0
         self._bar.reset(self._learner._total_timesteps)
-        self._bar.initial = self._bar.n = self.num_timesteps
+        self._bar.initial = self._bar.n = self._bar.last_print_n = self.num_timesteps
+        self._bar.refresh()
 
     @property
     def _learner(self) -> Learner:

@@ -190,6 +190,16 @@ def _left_out(lines: Sequence[str]) -> str:
     return "".join(f"Left out ({why}): {', '.join(names)}. " for why, names in runs.items())
 
 
+def _hours(runs: Sequence[Learned]) -> str:
+    """What runs took, as far as `regil bench` made them and says it."""
+    files = [path for run in runs if (path := Path(run.run) / "took.json").exists()]
+    if not files:
+        return ""
+    seconds = sum(json.loads(path.read_text("utf-8"))["seconds"] for path in files)
+    of = "" if len(files) == len(runs) else f" {len(files)} of"
+    return f"To make{of} them took {seconds / 3600:.1f} hours, one after the other. "
+
+
 def _draw(runs: Sequence[Learned], path: Path) -> None:
     with figure(path) as ((axis,),):
         for i, task in enumerate(dict.fromkeys(run.task for run in runs)):
@@ -239,6 +249,7 @@ def main(runs: Sequence[str] = (), out: str = "bench", dry_run: bool = False) ->
         "Spearman's rank correlation of both, runs with the same warm-up counted once: "
         f"{'; '.join(ranks)}. "
         + _left_out(left_out)
+        + _hours(found)
         + f"Read by {describe(('numpy', 'scipy', 'regil-sb3'))}"
     )
     folder = Path(out)

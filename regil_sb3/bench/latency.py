@@ -311,6 +311,7 @@ def main(out: str = "bench", dry_run: bool = False, **options: Any) -> list[Row]
     need_parquet("latency")
     process.set_threads()
     process.keep_freed_memory()  # as regil train does
+    begun = perf_counter()
     rows: list[Row] = []
     print("\n".join(table([])), flush=True)
     for row in latency(**options):
@@ -325,6 +326,7 @@ def main(out: str = "bench", dry_run: bool = False, **options: Any) -> list[Row]
         "one against together; others with the whole of their distances against search and S-DTW "
         "of 1 environment; librosa given the distances against S-DTW given the same. The paper's "
         f"means, DINOv3, 1 environment, 150 steps: {paper}. "
+        f"Seed 0; {(perf_counter() - begun) / 60:.1f} minutes; "
         f"{machine.describe((*_PACKAGES, 'librosa'))}"
     )
     print(f"\n{below}")

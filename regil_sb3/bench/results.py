@@ -63,7 +63,11 @@ def main(out: str = "bench", page: str = "docs/results.md") -> None:
         runs = planned(name, out)
         if todo := [run for run in runs if not run.finished]:
             missing[f"regil bench {name}"] = f"{len(todo)} of its {len(runs)} runs are not there"
-    written = f"Written by `regil bench results --out {out}`, from the tables that are kept there."
+    written = (
+        f"Written by `regil bench results --out {out}`, from the tables that are kept there, as is "
+        f"{markdown.with_suffix('.html').name}: with the tables' pictures, success over steps, and "
+        "how probably a run of one method beats one of another."
+    )
     parts = ["# Results", written]
     parts += [f"## {name}\n\n{text}" for name, text in texts.items()]
     if missing:

@@ -28,6 +28,7 @@ from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import yaml
 from tqdm import tqdm
 
@@ -257,11 +258,25 @@ def _other_defaults(run: Run, config: Path) -> list[str]:
 
 
 def predicted_hours(runs: Sequence[Run], workers: int) -> float:
-    """Hours that the unfinished runs will take, by what finished ones took a step."""
-    known = [(seconds_of(run), run.steps) for run in runs if run.finished]
-    told = [(seconds, steps) for seconds, steps in known if seconds is not None]
-    rate = sum(s for s, _ in told) / sum(n for _, n in told) if told else _SECONDS_A_STEP
-    return rate * sum(run.steps for run in runs if not run.finished) / max(workers, 1) / 3600
+    """Hours that the unfinished runs will take.
+
+    By what finished ones of the same algorithm took a step, else of any.
+    """
+    told: dict[str, list[tuple[float, int]]] = {}
+    steps: dict[str, int] = {}
+    for run in runs:
+        algo = run.settings_now.algo
+        if not run.finished:
+            steps[algo] = steps.get(algo, 0) + run.steps
+        elif (took := seconds_of(run)) is not None:
+            told.setdefault(algo, []).append((took, run.steps))
+    of_any = [pair for pairs in told.values() for pair in pairs]
+
+    def rate(algo: str) -> float:
+        seconds, made = np.sum(told.get(algo, of_any) or [(_SECONDS_A_STEP, 1)], axis=0)
+        return float(seconds / made)
+
+    return sum(rate(algo) * n for algo, n in steps.items()) / max(workers, 1) / 3600
 
 
 def finish(run: Run, patience: float = _GRACE) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -21,8 +22,9 @@ from toy import demonstration
 from regil_sb3.bench import run_tables
 from regil_sb3.bench import runs as runs_module
 from regil_sb3.bench.runs import Run, finish_all, machines, others, predicted_hours, seconds_of
+from regil_sb3.checkpoint.generations import Generations
 from regil_sb3.cli import main
-from regil_sb3.run_folder import has_checkpoint, locked
+from regil_sb3.run_folder import checkpoints_of, has_checkpoint, locked
 from regil_sb3.settings import Settings
 
 TINY = (
@@ -402,7 +404,8 @@ def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
     from ray.cluster_utils import Cluster
 
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([HERE, os.environ.get("PYTHONPATH", "")]))
-    runs = [toy_run(tmp_path, seed=seed, steps=600) for seed in range(3)]
+    often = {"env": "often_saved:Toy/Reach-v0", "steps": 2_000}
+    runs = [replace(toy_run(tmp_path, seed=seed), **often) for seed in range(3)]
     memory = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
     cluster = Cluster(initialize_head=True, head_node_args=memory)
     try:
@@ -411,8 +414,11 @@ def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
         with pytest.raises(ValueError, match=r"no node .* 1 CPUs, 1 GPUs and 0 GiB"):
             finish_all(runs, ray="auto", gpus=1)
 
+        def saved_thrice(run: Path) -> bool:
+            return max(Generations(checkpoints_of(run)).numbers, default=0) > 2
+
         def kill() -> None:
-            while sum((run.folder / "progress.csv").exists() for run in runs) < 2:
+            while sum(saved_thrice(run.folder) for run in runs) < 2:
                 time.sleep(0.2)
             cluster.remove_node(lost, allow_graceful=False)
 
@@ -421,10 +427,11 @@ def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
         assert finish_all(runs, ray="auto", memory=0.5) == []
         killer.join()
         assert all(run.finished for run in runs)
-        begun = [
-            (run.folder / "log.txt").read_text().count("evaluating policy:   0%") for run in runs
-        ]
-        assert begun == [1, 1, 1]  # none twice
+        logs = [(run.folder / "log.txt").read_text() for run in runs]
+        assert [log.count("evaluating policy:   0%") for log in logs] == [1, 1, 1]  # none twice
+        begun = [sum(line[-20:].count("?step/s") for line in log.split("\r")) for log in logs]
+        begun = [max(map(int, re.findall(r" (\d+)/2000 \[00:00<\?", log))) for log in logs]
+        assert sum(step > 0 for step in begun) == 1  # the lost one, from its checkpoint
     finally:
         ray.shutdown()
         cluster.shutdown()
