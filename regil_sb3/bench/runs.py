@@ -20,7 +20,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -222,15 +222,23 @@ def others(runs: Sequence[Run]) -> list[str]:
     Of one that is finished or begun, other settings or defaults; of one whose model is gone, an
     evaluation that is not enough.
     """
-    from regil_sb3.settings import Settings
+    from regil_sb3.settings import ALGOS, Settings
 
     lines = []
     for run in runs:
         if not (config := run.folder / "config.yaml").exists():
             continue
-        then, now = asdict(Settings.load(config, trust=True)), asdict(run.settings_now)
+        kept, asked = Settings.load(config, trust=True), run.settings_now
+        then, now = asdict(kept), asdict(asked)
+        defaults = yaml.safe_load(config.read_text("utf-8")).get("defaults") or {}
+        algorithm = ALGOS[asked.algo].__name__
+        # What is said now may have been a default then, and the other way round
+        names = {*kept.hyperparams, *asked.hyperparams}
+        for said, of in ((then, defaults), (now, asked.defaults())):
+            every = {**of.get(algorithm, {}), **said["hyperparams"]}
+            said["hyperparams"] = {name: every.get(name) for name in names}
         differ = [name for name in now if then[name] != now[name]]
-        if differ := differ or _other_defaults(run, config):
+        if differ := differ or _other_defaults(defaults, asked.defaults()):
             lines.append(
                 f"{run.folder} was made with other settings ({', '.join(differ)}): "
                 "remove it, and it is made again, or name another --out"
@@ -245,10 +253,8 @@ def others(runs: Sequence[Run]) -> list[str]:
     return lines
 
 
-def _other_defaults(run: Run, config: Path) -> list[str]:
-    """What its constructors' defaults were otherwise; runs of older versions do not say them."""
-    then = yaml.safe_load(config.read_text("utf-8")).get("defaults") or {}
-    now = run.settings_now.defaults()
+def _other_defaults(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Which of a run's constructors' defaults were other ones; older runs do not say them."""
     return [
         f"the default of {of}'s {name}"
         for of, arguments in now.items()
