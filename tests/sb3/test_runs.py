@@ -80,6 +80,10 @@ def test_runs_that_were_made_otherwise_are_named(runs, failed, monkeypatch):
     changed = replace(runs[0], settings=(*TINY[:-1], "eval_episodes=3", "k=4"))
     (line,) = others([changed, runs[1]])
     assert line.startswith(f"{runs[0].folder} was made with other settings (eval_episodes, ")
+    default = runs[0].settings_now.defaults()["TD3BC"]["tau"]
+    assert others([replace(runs[0], settings=(*TINY, f"tau={default}"))]) == []  # it was then
+    (line,) = others([replace(runs[0], settings=(*TINY, f"tau={default / 2}"))])
+    assert line.startswith(f"{runs[0].folder} was made with other settings (hyperparams)")
     with monkeypatch.context() as patch:
         make = runs[0].settings_now.defaults()
         make["TD3BC"] |= {"tau": 0.1, "added later": 3}
