@@ -109,11 +109,13 @@ def test_buffer_vs_learning_is_made_of_runs_alone(tmp_path, capsys):
     assert (tmp_path / "buffer-vs-learning.md").read_text().splitlines()[0] == (
         "    regil bench buffer-vs-learning"
     )
+    (other / "took.json").write_text('{"seconds": 5400}')
     for i in (8, 9):
         finished(tmp_path / f"unguided-{i}", 129, 19, warmup_steps=0)
     assert main(["bench", "buffer-vs-learning", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert "Left out (no guide acted in it): unguided-8, unguided-9. Read by" in out
+    assert "Left out (no guide acted in it): unguided-8, unguided-9. To make 1 of them took" in out
+    assert "took 1.5 hours, one after the other. Read by" in out
     named = ["bench", "buffer-vs-learning", "--runs", str(other), "--out", str(tmp_path / "b")]
     assert main(named) == 0
     assert f"--runs {other}" in (tmp_path / "b/buffer-vs-learning.md").read_text()

@@ -75,6 +75,22 @@ def test_runs_are_finished_once_and_failures_are_named(runs, failed):
     assert "commit" in machines(runs)[0]
 
 
+def test_hours_are_predicted_by_algorithm(tmp_path):
+    def run(method, seed, seconds=None):
+        env, preset = "regil/metaworld-hammer-v0", {"ReGIL": ""}.get(method, method)
+        run = Run(str(tmp_path), env, method, seed, 1_000, "", 0, preset)
+        run.folder.mkdir()
+        if seconds is not None:
+            (run.folder / "evaluation.json").write_text('{"policy": {"successes": []}}')
+            (run.folder / "took.json").write_text(json.dumps({"seconds": seconds}))
+        return run
+
+    finished = [run("ReGIL", 0, 800), run("ReGIL", 1, 1_000), run("baku", 0, 3_600)]
+    assert predicted_hours([*finished, run("ReGIL", 2)], 1) == pytest.approx(0.25)
+    assert predicted_hours([*finished, run("baku", 1), run("baku", 2)], 2) == pytest.approx(1.0)
+    assert predicted_hours([*finished, run("rot", 0)], 1) == pytest.approx(0.5)  # of any
+
+
 def test_runs_that_were_made_otherwise_are_named(runs, failed, monkeypatch):
     assert others(runs) == []
     changed = replace(runs[0], settings=(*TINY[:-1], "eval_episodes=3", "k=4"))
@@ -151,6 +167,8 @@ def test_tables_are_what_evaluations_say(tmp_path):
     assert [cell.strip() for cell in rl.strip("|").split("|")][:3] == ["RL", "-", "0.000"]
     rows = list(run_tables.raw(runs))
     assert len(rows) == 16
+    assert run_tables._in_brackets(run_tables.table(runs)).startswith("In brackets the paper's")
+    assert run_tables._in_brackets(run_tables.table(runs[3:4])) == ""  # of RL there is none
     assert "50,000 to 100,000 frames" in run_tables._paper_reached(rows)
     assert not run_tables._paper_reached(rows[8:])  # hammer's
     assert run_tables._better(rows) == "Above ReGIL: none. "
