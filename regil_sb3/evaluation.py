@@ -122,9 +122,10 @@ class ResetWhenAsked(gym.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step."""
+        self._seen = None  # before it: it may be broken off
         observation, reward, terminated, truncated, info = super().step(action)
-        ended = self.evaluates and (terminated or truncated)
-        self._seen = (observation, {}) if ended else None
+        if self.evaluates and (terminated or truncated):
+            self._seen = observation, {}
         return observation, reward, terminated, truncated, info
 
 

@@ -302,7 +302,8 @@ def resume(run: Path) -> Settings:
                 model = ALGOS[settings.algo].load(run / "model.zip", env=env, demo=demo)
             else:
                 model = _new_model(settings, demo, env)
-                env.reset()  # as a new run does: it may have been killed before a checkpoint
+                if not has_checkpoint(run):
+                    env.reset()  # as a new run does: it was killed before one
             _learn(model, settings, run, eval_env)
     return settings
 

@@ -278,7 +278,7 @@ class BAKU(SafeLoad, Offline):
         policy: "CnnPolicy" (``BAKUPolicy``), or a class.
         env: the environment that it will act in; nothing is learned from it.
         demo: the demonstration with actions, or its file.
-        learning_rate: of Adam; by default the authors'. At 3e-4 some seeds learn nothing for
+        learning_rate: of Adam; by default the authors'. At 3e-4 a run may learn nothing for
             thousands of updates.
         batch_size: steps of the demonstration in an update.
         stats_window_size: SB3's own.

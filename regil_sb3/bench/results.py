@@ -65,8 +65,8 @@ def main(out: str = "bench", page: str = "docs/results.md") -> None:
             missing[f"regil bench {name}"] = f"{len(todo)} of its {len(runs)} runs are not there"
     written = (
         f"Written by `regil bench results --out {out}`, from the tables that are kept there, as is "
-        f"{markdown.with_suffix('.html').name}: with the tables' pictures, success over steps, and "
-        "how probably a run of one method beats one of another."
+        f"{markdown.with_suffix('.html').name} beside it (not kept in the repository): with "
+        "pictures of tables, success over steps, and how probably a method's run beats another's."
     )
     parts = ["# Results", written]
     parts += [f"## {name}\n\n{text}" for name, text in texts.items()]

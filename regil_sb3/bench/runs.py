@@ -232,7 +232,7 @@ def others(runs: Sequence[Run]) -> list[str]:
         then, now = asdict(kept), asdict(asked)
         defaults = yaml.safe_load(config.read_text("utf-8")).get("defaults") or {}
         algorithm = ALGOS[asked.algo].__name__
-        # What is said now may have been a default then, and the other way round
+        # What is said of the algorithm now may have been its default then, and the other way round
         names = {*kept.hyperparams, *asked.hyperparams}
         for said, of in ((then, defaults), (now, asked.defaults())):
             every = {**of.get(algorithm, {}), **said["hyperparams"]}

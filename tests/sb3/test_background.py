@@ -293,11 +293,22 @@ def test_a_robot_does_nothing_again_when_a_run_goes_on(robot, tmp_path, monkeypa
         main(robot)
     monkeypatch.setattr(training.TrainingCallback, "_on_step", step)
     monkeypatch.setattr(Robot, "steps_of_all", 0)
+    monkeypatch.setattr(Robot, "put_back", 0)
+    restore, before = training.CheckpointCallback.restore, []
+
+    def restored(self, model):
+        before.append(Robot.put_back)
+        return restore(self, model)
+
+    monkeypatch.setattr(training.CheckpointCallback, "restore", restored)
     monkeypatch.setattr(training, "evaluate_run", lambda *_: (_ for _ in ()).throw(StoppedError))
     capsys.readouterr()
     with pytest.raises(StoppedError), pytest.warns(UserWarning, match="ended as truncated"):
         main(["train", "--resume", str(tmp_path / "run")])
     assert Robot.steps_of_all == 200 - 130
+    assert before == [0]  # the guide goes on from what was saved: the scene is put back after that
+    assert Robot.put_back > 0
+    assert Robot.in_vain == 0
 
 
 def test_a_robot_is_paused_while_the_policy_is_evaluated_in_another(words, tmp_path, monkeypatch):
