@@ -15,7 +15,7 @@ from pathlib import Path
 
 from regil_sb3.bench.run_tables import LEARNING, planned
 from regil_sb3.files import replacing
-from regil_sb3.report.comparison import NOTE, plots, scores
+from regil_sb3.report.comparison import MOST, NOTE, plots, scores
 from regil_sb3.report.page import card, write_page
 from regil_sb3.report.run_contents import RunContents, read_run
 
@@ -113,7 +113,18 @@ def _learning(out: Path, name: str) -> tuple[str, list[str]]:
             named.setdefault(method, []).append(read_run(out / run))
         else:
             gone.append(f"{out / run}, a run of {name}, is not there any more")
-    return scores(named) + plots(named) if named else "", gone
+    return "".join(scores(part) + plots(part) for part in _parts(named)), gone
+
+
+def _parts(named: dict[str, list[RunContents]]) -> list[dict[str, list[RunContents]]]:
+    """What is drawn together: all, or of too many each method and its own changes."""
+    if len(named) <= MOST:
+        return [named] if named else []
+    parts: dict[str, dict[str, list[RunContents]]] = {}
+    for method, runs in named.items():
+        own = next((first for first in parts if method.startswith(f"{first}_")), method)
+        parts.setdefault(own, {})[method] = runs
+    return list(parts.values())
 
 
 def _picture(path: Path) -> str:

@@ -20,10 +20,11 @@ from regil_sb3.report.charts import Line, line_chart
 from regil_sb3.report.page import card, flat, write_page
 from regil_sb3.report.run_contents import RunContents, column, number, read_run, successes
 
-__all__ = ["NOTE", "methods", "plots", "scores", "write_comparison"]
+__all__ = ["MOST", "NOTE", "methods", "plots", "scores", "write_comparison"]
 
 _COLOURS = 6  # as many as the page has for methods
 _STYLES = ("solid", "dashed", "dotted")  # of lines: a colour comes once in each
+MOST = _COLOURS * len(_STYLES)  # methods that can be told apart
 _NOT_COMPARED = ("versions.", "defaults.")  # what begins so
 _OF_A_SEED = {"env", "seed", "demo_actions"}
 _NAMED = 2  # settings in a method's name
@@ -97,10 +98,10 @@ def plots(named: Named, beside: str = "") -> str:
     Raises:
         ValueError: there are more methods than lines that can be told apart.
     """
-    if len(named) > (most := _COLOURS * len(_STYLES)):
+    if len(named) > MOST:
         raise ValueError(
             f"these are runs of {len(named)} methods ({'; '.join(named)}): compare at most "
-            f"{most} at once"
+            f"{MOST} at once"
         )
     columns = (
         card("Success over steps", _curves(named)),

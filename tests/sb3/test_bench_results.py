@@ -71,6 +71,25 @@ def test_learning_tables_have_plots(bench, tmp_path):
     assert "metaworld-hammer-ReGIL-2-15000, a run of ablations, is not there any more" in shown
 
 
+def test_of_many_methods_each_is_drawn_with_its_own_changes(bench, tmp_path):
+    methods = [
+        of + change for of in ("ReGIL", "BC") for change in ("", *map("_{}".format, range(9)))
+    ]
+    rows = []
+    for method in methods:
+        folder = bench / f"metaworld-hammer-{method}-2-15000"
+        made_run.run(folder, "regil/metaworld-hammer-v0", 2, 19, films=False)
+        rows.append({"method": method, "run": folder.name, "evaluated": "policy"})
+    write(bench, "tuning", {}, TABLE, "there", rows)
+    assert main(words(bench, tmp_path / "results.md")) == 0
+    shown = (tmp_path / "results.html").read_text()
+    parts = shown.split("Success in unseen episodes, interquartile mean")[1:]
+    assert [re.findall(r"<span>((?:ReGIL|BC)\w*)</span>", part) for part in parts] == [
+        methods[:10],
+        methods[10:],
+    ]
+
+
 def test_a_table_of_more_steps_stands_beside_its_own(bench, tmp_path):
     for called in ("ablations-60000", "ablations-7500", ""):
         rows = [{"task": "hammer", "method": "RL", "run": "gone", "evaluated": "policy"}]
