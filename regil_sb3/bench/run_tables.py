@@ -193,11 +193,11 @@ def _median(rows: Iterable[dict[str, Any]], column: str) -> str:
     return f"{value:,.0f}" if np.isfinite(value) else "-"
 
 
-def _in_brackets(lines: Sequence[str]) -> str:
+def _in_brackets(runs: Sequence[Run]) -> str:
     """What stands in brackets behind a task's success, where something does."""
-    names, *_ = lines
-    tasks = slice(1, names.split(" | ").index("IQM (95 %)"))
-    if not any("(" in cell for line in lines[2:] for cell in line.split(" | ")[tasks]):
+    paper = said()["paper"]["success"]
+    told = [run for run in runs if (run.paper or run.method) in paper.get(task_of(run.env), {})]
+    if not any(run.finished for run in told):
         return ""
     return (
         "In brackets the paper's, after 300,000 frames (LIBERO's 500,000), of BC and BAKU after "
@@ -310,7 +310,7 @@ def main(
         not_made = [run.folder.name for run in runs if not run.finished]
         hours = sum(seconds_of(run) or 0 for run in runs if run.finished) / 3600
         below = (
-            f"{_in_brackets(lines)}{_better(rows)}{_paper_reached(rows)}{_narrow(rows)}"
+            f"{_in_brackets(runs)}{_better(rows)}{_paper_reached(rows)}{_narrow(rows)}"
             + (f"Not made: {', '.join(not_made)}. " if not_made else "")
             + "What was tuned for which method: docs/baselines.md. "
             f"Seeds {seeds}; {hours:.1f} hours, one run after the other; {together(machines(runs))}"

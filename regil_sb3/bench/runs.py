@@ -230,15 +230,16 @@ def others(runs: Sequence[Run]) -> list[str]:
             continue
         kept, asked = Settings.load(config, trust=True), run.settings_now
         then, now = asdict(kept), asdict(asked)
-        defaults = yaml.safe_load(config.read_text("utf-8")).get("defaults") or {}
+        defaults_then = yaml.safe_load(config.read_text("utf-8")).get("defaults") or {}
+        defaults_now = asked.defaults()
         algorithm = ALGOS[asked.algo].__name__
         # What is said of the algorithm now may have been its default then, and the other way round
         names = {*kept.hyperparams, *asked.hyperparams}
-        for said, of in ((then, defaults), (now, asked.defaults())):
-            every = {**of.get(algorithm, {}), **said["hyperparams"]}
+        for said, defaults in ((then, defaults_then), (now, defaults_now)):
+            every = {**defaults.get(algorithm, {}), **said["hyperparams"]}
             said["hyperparams"] = {name: every.get(name) for name in names}
         differ = [name for name in now if then[name] != now[name]]
-        if differ := differ or _other_defaults(defaults, asked.defaults()):
+        if differ := differ or _other_defaults(defaults_then, defaults_now):
             lines.append(
                 f"{run.folder} was made with other settings ({', '.join(differ)}): "
                 "remove it, and it is made again, or name another --out"
